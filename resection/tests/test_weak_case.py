@@ -29,7 +29,7 @@ def test_an_organ_cut_by_its_image_is_said_by_prepare_locate_track_and_plan(phan
     succeeded(said)
     case = load_case(folder)
     assert "cut" in [warning.kind for warning in case.warnings]
-    (warning,) = (warning for warning in case.warnings if warning.kind == "cut")
+    (warning,) = (warning.words for warning in case.warnings if warning.kind == "cut")
     assert warning in said.stdout + said.stderr
 
     write_cloud_ply(tmp_path / "cloud.ply", cloud_by_rays(case, looking_down(case)))

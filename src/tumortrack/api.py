@@ -120,7 +120,7 @@ def prepare(
         from tumortrack.report.pictures import qc_picture
 
         with store.new_folder(Path(folder), overwrite) as aside:
-            doubts: list[str] = [*case.warnings]
+            doubts = [weakness.words for weakness in case.warnings]
             if doubtful := case.report["half_turn"]["warning"]:
                 doubts.append(doubtful)
             about = str(case.patient), doubts

@@ -190,7 +190,7 @@ def test_an_unreadable_input_is_named_and_no_folder_stays(tmp_path, monkeypatch)
     def refuse(*_: object) -> None:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("tumortrack.imaging.prepare.read_raw", refuse)
+    monkeypatch.setattr("tumortrack.imaging.volume.read_raw", refuse)
     with pytest.raises(InputError, match=r"ball\.nii cannot be read: Permission denied"):
         Prepare(input=source, case=tmp_path / "new" / "dir" / "case").run()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["ball.nii"]

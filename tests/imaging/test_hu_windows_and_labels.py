@@ -6,6 +6,7 @@ from scipy import ndimage
 
 from imaging_objects import kidney_labels
 from tumortrack.core.errors import InputError
+from tumortrack.core.report import Finding
 from tumortrack.core.types import LabelVolume, Volume
 from tumortrack.imaging.grid import label_counts, voxel_ml
 from tumortrack.imaging.hu_windows import segment_ct
@@ -224,7 +225,9 @@ def test_a_tumor_far_off_is_refused_or_loudly_left_out():
     labels[ball] = 2
     found, notes, _ = select_labels(LabelVolume(labels, far.lps_from_index))
     assert volumes(found)[2] == pytest.approx(float(ball.sum()) / 1000)
-    assert any(note.startswith("LEFT OUT: tumor of 17.") for note in notes), notes
+    (left_out,) = (note for note in notes if isinstance(note, Finding))
+    assert (left_out.kind, left_out.values["what"]) == ("left_out", "tumor")
+    assert 17 <= left_out.values["ml"] < 18
 
 
 def test_a_kidney_mostly_tumor_is_a_kidney_still():

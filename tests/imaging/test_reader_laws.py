@@ -12,7 +12,7 @@ import pytest
 
 from imaging_objects import kidney_labels, write_dicom, write_nifti
 from tumortrack.core import store
-from tumortrack.core.case_warning import warnings_in
+from tumortrack.core.config import findings_in
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import LabelVolume, Volume
 from tumortrack.imaging.case import load_case, save_case
@@ -187,7 +187,9 @@ def test_a_case_of_before_has_no_warnings(phantom, tmp_path):
     path.write_text(json.dumps(manifest))
     assert load_case(tmp_path / "case").warnings == ()
     with pytest.raises(InputError):
-        warnings_in([{"kind": "of_another_version", "values": {}}], "x")
+        findings_in([{"kind": "of_another_version", "values": {}}], "x")
+    with pytest.raises(InputError):
+        findings_in([{"kind": "cut", "values": {}}], "x")
 
 
 @every
@@ -291,7 +293,7 @@ def test_several_files_in_one_call_and_a_tumors_file_alone(phantom, tmp_path):
 def test_a_size_that_no_kidney_has_is_told(phantom, tmp_path):
     large = replace(phantom, affine=phantom.affine * [[2.0], [2.0], [2.0], [1.0]])
     case = prepare(nifti(large, tmp_path))
-    assert kinds(case)["size"]["ml"] == pytest.approx(8 * KIDNEY_ML, rel=0.015)
+    assert kinds(case)["volume"]["ml"] == pytest.approx(8 * KIDNEY_ML, rel=0.015)
 
 
 @pytest.mark.parametrize("off", [2e-8, 5e-4, -5e-4, 2e-3])

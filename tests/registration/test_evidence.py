@@ -409,13 +409,17 @@ def test_a_table_says_the_same(tmp_path):
     file.write_bytes(b"\xef\xbb\xbf" + TABLE.encode())  # as spreadsheets write it
     assert read_evidence(file) == told
     wrong = {
-        "frame 'camera, robot'": TABLE.replace("1,camera", "1,robot"),
+        "line 2 is in frame 'robot'": TABLE.replace("1,camera", "1,robot"),
         "line 2, column x_mm": TABLE.replace("1.5,2", "far,2"),
-        "no column 'smell'": TABLE.replace("part,", "smell,"),
-        "line 4: piece 2 differs": TABLE.replace("tumor_1,5", ",5"),
-        "no column for z_mm": TABLE.replace("y_mm,z_mm,std", "y_mm,point_std_mm,std"),
+        "the column 'smell'": TABLE.replace("part,", "smell,"),
+        "line 4: piece 2 has a row before": TABLE.replace("tumor_1,5", ",5"),
+        "lacks z_mm": TABLE.replace("y_mm,z_mm,std", "y_mm,point_std_mm,std"),
         "has no rows": TABLE.splitlines()[0],
-        "not a valid": TABLE.replace("touch", "smell"),
+        "line 2: not a valid": TABLE.replace("touch", "smell"),
+        "line 3: not a valid": TABLE.replace("outline,tumor_1", "outline,"),
+        "line 3: outline std_mm is 99": TABLE.replace("140,,", "140,99,").replace(
+            "139,,", "139,99,"
+        ),
     }
     for words, given in wrong.items():
         file.write_text(given)

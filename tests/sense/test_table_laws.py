@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from tumortrack.core.types import Intrinsics
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.poses import FilePoses
 from tumortrack.sense.files import read_camera, read_cloud, read_depth, read_poses
+from tumortrack.sense.ply import cloud_ply
 from tumortrack.simulate.scene_folder import list_scenes
 from tumortrack.tracking.points import read_points
 
@@ -236,6 +238,45 @@ def test_what_stands_for_no_depth_counts_as_none(suffix, kind, tmp_path):
         assert unit_mm == 0.1
         assert np.isnan(frame.depth_mm[1]).all()
         np.testing.assert_allclose(frame.depth_mm[::2], DEPTHS[::2] * 0.1, rtol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["npy", "npz"])
+def test_arrays_of_points_have_one_of_three_shapes_and_say_what_was_left_out(kind, tmp_path):
+    path, points = tmp_path / f"a.{kind}", np.arange(36.0).reshape(12, 3) + 100
+    normals = np.hstack([points, np.zeros((12, 3))])
+
+    def read(array: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+        np.save(path, array) if kind == "npy" else np.savez(path, cloud=array)
+        cloud, notes = read_cloud(path)
+        return cloud.points_mm, notes
+
+    for array, wide in ((points, 0), (points.reshape(4, 3, 3), 0), (normals, 6)):
+        read_mm, notes = read(array)
+        np.testing.assert_array_equal(read_mm, points)
+        assert [f"of {wide} columns" in note for note in notes] == [True] * bool(wide)
+    for array in (points.reshape(9, 4), points.reshape(4, 3, 3).astype(np.uint8)):
+        with pytest.raises(InputError):
+            read(array)
+
+
+def test_properties_of_points_may_be_capitals_but_not_twice(tmp_path):
+    path, points = tmp_path / "a.ply", np.arange(12.0).reshape(4, 3) + 100
+    content = cloud_ply(points, {})
+    path.write_bytes(content.replace(b"float x", b"float X").replace(b"float z", b"float Z"))
+    np.testing.assert_array_equal(read_cloud(path)[0].points_mm, points)
+    path.write_bytes(content.replace(b"float y", b"float X"))
+    with pytest.raises(InputError):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize("axis", ["cx", "cy"])
+def test_an_optical_axis_on_the_border_is_one_that_is_not_known(axis, tmp_path):
+    path = tmp_path / "c.json"
+    write_intrinsics(path, replace(CAMERA, **{axis: 0.5}))
+    read_camera(path)
+    write_intrinsics(path, replace(CAMERA, **{axis: 0.0}))
+    with pytest.raises(InputError):
+        read_camera(path)
 
 
 def test_an_array_is_a_cloud_or_with_a_camera_a_depth_image(tmp_path):

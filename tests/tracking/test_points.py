@@ -170,7 +170,7 @@ def test_an_answer_can_be_asked_again(tmp_path):
         ("x,y,z\n1,2,3\n1,2,nan\n", "line 3: .* NaN"),
         ("x,y,z\n1,inf,3\n", "line 2: .*10 km away"),
         ("x,y,z\n1,1e300,3\n", "line 2: .*10 km away"),
-        ("x,y,z\n1,two,3\n", "line 2: '1, two, 3' is no point"),
+        ("x,y,z\n1,two,3\n", "line 2, column y: 'two' is no number"),
         ("x,y,z\n1,,3\n", "line 2"),
         ('x,y,z\n1,2,"3\n', "line"),
     ],
@@ -222,6 +222,13 @@ def test_fiducial_lists_honour_their_coordinate_system(tmp_path, system, place):
     np.testing.assert_allclose(places(rows), Wave().carry(table.points_ct), atol=6e-5)
 
 
+def test_a_fiducial_may_begin_with_the_sign_of_a_comment(tmp_path):
+    text = FCSV.format("LPS", LPS_PLACE, 2).replace("\n1,", "\n#1,").replace("F-2", "F#2")
+    table = read_points(written(tmp_path / "F.fcsv", text))
+    np.testing.assert_array_equal(table.points_ct, [[60.5, 40, -300], [1, 2, 3]])
+    assert [row[0] for row in table.rows] == ["hilum", "F#2"]
+
+
 def test_fiducials_without_a_place_are_left_out_with_a_note(tmp_path):
     table = read_points(written(tmp_path / "F.fcsv", FCSV.format("LPS", LPS_PLACE, 0)))
     np.testing.assert_array_equal(table.points_ct, [[60.5, 40, -300]])
@@ -256,7 +263,7 @@ def test_markups_honour_their_coordinate_system(tmp_path, system, place, units):
         (markups("IJK"), "system is IJK; it must be LPS or RAS"),
         (markups(None), "system is missing"),
         (markups(coordinateUnits="m"), "unit is 'm'"),
-        (markups(place=(1, 2)), "point 'hilum'"),
+        (markups(place=(1, 2)), r"controlPoints\[0\].position"),
         (markups(place=("a", 1, 2)), "no markups file"),
         ({"markups": []}, "holds no points"),
         ([1], "no markups file"),

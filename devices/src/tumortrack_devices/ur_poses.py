@@ -55,8 +55,7 @@ class UrPoses(CameraPoses):
             link = _Link(host)
         except (OSError, ValueError) as error:  # ValueError: a name that cannot be one
             raise InputError(
-                f"ur: the arm at {host} cannot be read ({error}). Is it on, and reachable on port "
-                f"{_PORT}?"
+                f"ur: the arm at {host}, port {_PORT}, cannot be read ({error}). Is it on?"
             ) from error
         self._thread = threading.Thread(
             target=self._read, args=(link,), name="ur poses", daemon=True

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
-from tumortrack.core.case_warning import warnings_in
+from tumortrack.core.config import findings_in
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import rigid
@@ -95,7 +95,7 @@ def read_run(folder: Path) -> Located:
     path = folder / "occupancy.ply"
     try:
         report = msgspec.convert(stored, _Report)
-        weak = warnings_in(report.model.get("warnings"), str(folder))
+        weak = findings_in(report.model.get("warnings"), str(folder))
         content = path.read_bytes()
         table = parse_ply_properties(content, str(path), ("x", "y", "z", "label", "probability"))
     except (OSError, InputError, msgspec.ValidationError) as error:

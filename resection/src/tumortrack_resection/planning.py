@@ -178,7 +178,7 @@ def plan_cuts(
     moved_mm: float = MOVED_MM,
 ) -> Cuts:
     """Where to cut a run, without the arms."""
-    weak = (f"{WEAK_CASE}: {warning}." for warning in run.weak)
+    weak = (f"{WEAK_CASE}: {warning.words}." for warning in run.weak)
     doubts = (*poor_estimate_notes(run.doubt, accept_poor), *weak)
     located = run.moved(frames.published_from_camera)
     cell = below(located.organ, cell or CellConfig())

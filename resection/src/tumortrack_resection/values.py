@@ -14,13 +14,12 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
-from tumortrack.core.case_warning import CaseWarning
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.organ import organ_name
 from tumortrack.core.patient import NOBODY, Patient
-from tumortrack.core.report import MarginReport
+from tumortrack.core.report import Finding, MarginReport
 from tumortrack.core.types import FIRST_TUMOR, Mesh
 
 Method = Literal["published", "margin"]
@@ -117,7 +116,7 @@ class Located:
     margin: MarginReport | None = None
     structures: Mapping[str, Mesh] = field(default_factory=dict)
     doubt: str = ""
-    weak: tuple[CaseWarning, ...] = ()
+    weak: tuple[Finding, ...] = ()
 
     def moved(self, b_from_a: Float[np.ndarray, "4 4"]) -> Located:
         """The same in another frame."""

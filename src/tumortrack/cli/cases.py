@@ -69,7 +69,8 @@ class Prepare(PrepareOptions):
         model, weakness = folder / case.MODEL, ""
         if is_finished(model):
             weakness = weakness_of(read_model_manifest(model)["provenance"])
-        say_notes(filter(None, [*case.warnings, weakness, *case.report.get("notes", [])]))
+        notes = *(each.words for each in case.warnings), weakness, *case.report.get("notes", [])
+        say_notes(filter(None, notes))
         say(str(case.patient))
         kind = case.anatomy.kind
         if not kind.identified(case.patient):

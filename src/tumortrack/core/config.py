@@ -6,7 +6,8 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, readable
+from tumortrack.core.report import Finding
 
 
 class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -49,8 +50,18 @@ def to_builtins(config: msgspec.Struct) -> dict[str, Any]:
 
 def from_builtins(data: object, kind: type[C], where: str) -> C:
     """The inverse. Raises InputError, which names ``where`` the data came from: an unknown key, a
-    wrong type or a missing value."""
+    wrong type, a missing value, or one that is not allowed."""
     try:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
         raise InputError(f"{where}: not a valid {kind.__name__}: {error}.") from error
+    except InputError as error:  # of its own checks
+        raise InputError(f"{where}: {error}") from error
+
+
+def findings_in(entries: object, where: str) -> tuple[Finding, ...]:
+    """Likewise of findings; none: of a version that knew none."""
+    with readable(where, "has findings that are none of this version"):
+        found = msgspec.convert(entries or (), tuple[Finding, ...])
+        _ = [finding.words for finding in found]  # their values are there
+    return found

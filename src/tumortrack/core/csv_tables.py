@@ -6,11 +6,16 @@ import codecs
 import csv
 import io
 import re
+from collections.abc import Callable, Sequence
 from decimal import Decimal, InvalidOperation
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError
 
+T = TypeVar("T")
 _ABOVE = re.compile(r"((#.*|sep=.)?\r?\n)*")  # Excel states its separator so
 _DECIMAL = re.compile(r"^(-?\d*),(\d+)$")
 _UTF16 = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
@@ -19,6 +24,7 @@ _UTF16 = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 class Rows(NamedTuple):
     """A table's header, and each row's line in the file and cells, as many as there are columns."""
 
+    name: str
     header: tuple[str, ...]
     rows: tuple[tuple[int, tuple[str, ...]], ...]
 
@@ -27,13 +33,29 @@ class Rows(NamedTuple):
         """Places of the columns by name, in lower case."""
         return {cell.lower(): place for place, cell in enumerate(self.header)}
 
+    def column(self, name: str, read: Callable[[str, str], T]) -> list[T]:
+        """Its cells, by ``number_in`` or ``whole_in``, whose errors name line and column."""
+        at = self.columns[name]
+        return [
+            read(row[at], f"{self.name}, line {line}, column {name}") for line, row in self.rows
+        ]
 
-def read_rows(content: bytes, name: str) -> Rows:
+    def numbers(self, names: Sequence[str]) -> Float64[np.ndarray, "rows columns"]:
+        """Of several columns. Raises InputError."""
+        return np.reshape(
+            [self.column(name, number_in) for name in names], (len(names), len(self.rows))
+        ).T
+
+
+def read_rows(
+    content: bytes, name: str, needed: Sequence[str] = (), further: Sequence[str] | None = None
+) -> Rows:
     """A table as spreadsheets write it: UTF-8, or UTF-16 with its mark; separated by commas, or by
     semicolons or tabs, and then perhaps with decimal commas. Spaces round cells, empty rows,
     separators at the ends of rows, and lines above the header that begin with # do not count.
 
-    Raises InputError: no text or table, no header, a column twice, a row with more or fewer cells.
+    Raises InputError: no text or table, no header, a column twice, a row with more or fewer cells,
+    a ``needed`` column is missing, or one is neither that nor ``further`` (None: all are allowed).
     """
     text = text_of(content, name)
     above = _ABOVE.match(text).end()  # type: ignore[union-attr]  # it matches what is empty, too
@@ -58,16 +80,20 @@ def read_rows(content: bytes, name: str) -> Rows:
     lower, kept = [cell.lower() for cell in header], []
     if doubled := [cell for cell in lower if lower.count(cell) > 1]:
         raise InputError(
-            f"{name} has the column {doubled[0]!r} twice; its columns {','.join(header)} must have "
-            "different names."
+            f"{name} has the column {doubled[0]!r} twice; columns must have different names."
         )
+    strange = [] if further is None else [c for c in lower if c not in (*needed, *further)]
+    if strange or (missing := [column for column in needed if column not in lower]):
+        fault = f"has the column {strange[0]!r}" if strange else f"lacks {', '.join(missing)}"
+        allowed = f", and perhaps {', '.join(further)}" if further else ""
+        raise InputError(f"{name} {fault}; its columns must be {', '.join(needed)}{allowed}.")
     for line, row in lines[1:]:
         while len(row) > len(header) and not row[-1]:
             row.pop()
         if len(row) != len(header):
             raise InputError(f"{name}, line {line}: {len(row)} values in {len(header)} columns.")
         kept.append((line, tuple(row)))
-    return Rows(tuple(header), tuple(kept))
+    return Rows(name, tuple(header), tuple(kept))
 
 
 def text_of(content: bytes, name: str) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -22,6 +24,18 @@ class InputError(TumortrackError):
     """Unusable input: a file, a number, a combination of options."""
 
     exit_code = 2
+
+
+@contextmanager
+def readable(file: object, fault: str = "cannot be read") -> Iterator[None]:
+    """Libraries raise anything on a damaged ``file``: in this context it becomes an InputError."""
+    try:
+        yield
+    except TumortrackError:
+        raise
+    except Exception as error:
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
+        raise InputError(f"{file} {fault}: {reason.strip().rstrip('.')}.") from error
 
 
 class ArtifactError(InputError):

@@ -3,7 +3,7 @@ where there is no tissue. Camera frame, mm."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -56,14 +56,10 @@ class _Evidence(Config, frozen=True, kw_only=True, tag_field="kind"):
             if not (np.abs(places) <= _REACH_MM).all():
                 raise InputError(
                     f"{self.name}: {field} reaches {np.abs(places).max():g}; allowed: up to "
-                    f"{_REACH_MM:g}. Places are in the camera's frame, points of the CT in LPS; "
-                    "both in mm."
+                    f"{_REACH_MM:g} mm, places in the camera's frame, points of the CT in LPS."
                 )
             if field != "point_ct" and np.abs(places).max() < _LEAST_MM:
-                raise InputError(
-                    f"{self.name}: {field} lies within {_LEAST_MM:g} mm of the camera: is it in "
-                    "metres? Allowed: mm."
-                )
+                raise InputError(f"{self.name}: {field} lies at the camera: is it in metres?")
             msgspec.structs.force_setattr(self, field, _tuples(places))
 
     @property
@@ -152,14 +148,9 @@ def _tuples(places: np.ndarray) -> Any:
 def read_evidence(path: Path) -> tuple[Evidence, ...]:
     """Of a JSON file, see ``EvidenceFile``, or a table (.csv), a row for each place. Raises
     InputError: missing, another frame or unit, a value that is not allowed."""
-    is_table = path.suffix.lower() in (".csv", ".tsv", ".txt")
-    given = _table(path) if is_table else store.read_json(path)
-    known = from_builtins(given, EvidenceFile, str(path))
-    if (known.frame, known.unit) != ("camera", "mm"):
-        raise InputError(
-            f"{path} is in frame {known.frame!r} and unit {known.unit!r}; allowed: frame "
-            "'camera' (x right, y down, z forward) and unit 'mm'. Transform it first."
-        )
+    if path.suffix.lower() in (".csv", ".tsv", ".txt"):
+        return _table(path)
+    known = _checked(store.read_json(path), str(path))
     if not known.evidence:
         raise InputError(f"{path} holds no evidence. Leave it out, or add some.")
     for number, each in enumerate(known.evidence, start=1):
@@ -171,54 +162,59 @@ def read_evidence(path: Path) -> tuple[Evidence, ...]:
     return known.evidence
 
 
-_PLACE, _POINT = ("x_mm", "y_mm", "z_mm"), ("x_ct_mm", "y_ct_mm", "z_ct_mm")
-_NUMBERS = {*_PLACE, *_POINT, "std_mm", "shared_std_mm", "tip_mm", "point_std_mm", "stamp_ns"}
-_NEEDED = ("piece", "frame", "kind", *_PLACE)
-_COLUMNS = {*_NUMBERS, *_NEEDED, "part", "tool"}
-
-
-def _table(path: Path) -> dict[str, Any]:
-    """The rows of a table as an ``EvidenceFile``; rows of one ``piece`` are places of one."""
-    table = read_rows(store.read_file(path, _LARGEST_FILE), str(path))
-    names = table.columns
-    if unknown := [name for name in names if name not in _COLUMNS]:
+def _checked(given: dict[str, Any], where: str) -> EvidenceFile:
+    known = from_builtins(given, EvidenceFile, where)
+    if (known.frame, known.unit) != ("camera", "mm"):
         raise InputError(
-            f"{path}: there is no column {unknown[0]!r}. Allowed: {', '.join(sorted(_COLUMNS))}."
+            f"{where} is in frame {known.frame!r} and unit {known.unit!r}; allowed: frame 'camera' "
+            "(x right, y down, z forward) and unit 'mm'. Transform it first."
         )
-    if missing := [n for n in _NEEDED if n not in names]:
-        raise InputError(f"{path} has no column for {', '.join(missing)}.")
-    pieces: dict[str, dict[str, Any]] = {}
+    return known
+
+
+_PLACE, _POINT = ("x_mm", "y_mm", "z_mm"), ("x_ct_mm", "y_ct_mm", "z_ct_mm")
+_SIZES = ("std_mm", "shared_std_mm", "tip_mm", "point_std_mm")
+_NEEDED = ("piece", "frame", "kind", *_PLACE)
+_READ: dict[str, Callable[[str, str], float]] = {
+    **dict.fromkeys((*_PLACE, *_POINT, *_SIZES), number_in),
+    "stamp_ns": whole_in,
+}
+_FURTHER = (*_READ, "part", "tool")
+_OF_PLACES = ("outline", "free")
+
+
+def _table(path: Path) -> tuple[Evidence, ...]:
+    """From a table, in which rows of one ``piece`` are places of one."""
+    table = read_rows(store.read_file(path, _LARGEST_FILE), str(path), _NEEDED, _FURTHER)
+    pieces: dict[str, tuple[str, dict[str, Any], list[Any]]] = {}
     for line, row in table.rows:
-        given = _cells(dict(zip(names, row, strict=True)), f"{path}, line {line}")
-        number, place = given.pop("piece"), [given.pop(n) for n in _PLACE]
+        where = f"{path}, line {line}"
+        given = _cells(dict(zip(table.columns, row, strict=True)), where)
+        piece, place = given.pop("piece"), [given.pop(n) for n in _PLACE]
         if _POINT[0] in given:
             given["point_ct"] = [given.pop(n, None) for n in _POINT]
-        each = pieces.setdefault(number, {**given, "places_mm": []})
-        if {**given, "places_mm": each["places_mm"]} != each:
+        _, known, places = pieces.setdefault(piece, (where, given, []))
+        if given != known or (places and given["kind"] not in _OF_PLACES):
             raise InputError(
-                f"{path}, line {line}: piece {number} differs from its rows before, which only its "
-                "places may. Give another piece another name."
+                f"{where}: piece {piece} has a row before; only an outline or free places have "
+                "several, which differ in x, y and z alone. Give another piece another name."
             )
-        if each["places_mm"] and given["kind"] not in ("outline", "free"):
-            raise InputError(
-                f"{path}, line {line}: piece {number} has a place already, and a {given['kind']} "
-                "has one. Give another piece another name."
-            )
-        each["places_mm"].append(place)
-    frames = {each.pop("frame") for each in pieces.values()}
-    for each in pieces.values():
-        if each["kind"] not in ("outline", "free"):
-            (each["place_mm"],) = each.pop("places_mm")
-    return {"frame": ", ".join(sorted(frames)), "unit": "mm", "evidence": list(pieces.values())}
+        places.append(place)
+    found: list[Evidence] = []
+    for where, given, places in pieces.values():
+        several = given["kind"] in _OF_PLACES
+        given |= {"places_mm": places} if several else {"place_mm": places[0]}
+        whole = {"frame": given.pop("frame"), "unit": "mm", "evidence": [given]}
+        found += _checked(whole, where).evidence
+    return tuple(found)
 
 
 def _cells(row: dict[str, str], where: str) -> dict[str, Any]:
     """What a row says, by column."""
     if empty := [name for name in _NEEDED if not row[name]]:
         raise InputError(f"{where}, column {empty[0]}: it is empty; every row needs it.")
-    read = dict.fromkeys(_NUMBERS, number_in) | {"stamp_ns": whole_in}
     return {
-        name: read[name](text, f"{where}, column {name}") if name in read else text
+        name: _READ[name](text, f"{where}, column {name}") if name in _READ else text
         for name, text in row.items()
         if text
     }

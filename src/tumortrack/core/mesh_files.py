@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, readable
 from tumortrack.core.organ import KIDNEY, Organ
 from tumortrack.core.store import read_file, writing
 from tumortrack.core.types import Anatomy, Mesh
@@ -28,13 +28,11 @@ def read_mesh(path: Path) -> Mesh:
         raise InputError(f"{path}: unknown mesh type. Allowed: {', '.join(SUFFIXES)}.")
     content = read_file(path, _LARGEST_FILE, "Reduce the mesh first.")
     logging.getLogger("trimesh").addHandler(_SILENT)
-    try:  # from memory, so that no other file that it names, such as a texture, is opened
-        loaded = trimesh.load_mesh(
+    with readable(path, "cannot be read as a mesh"):
+        loaded = trimesh.load_mesh(  # from memory, so that no texture that it names is opened
             io.BytesIO(content), path.suffix.lower()[1:], process=False, skip_materials=True
         )
         vertices, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
-    except Exception as error:  # trimesh raises anything on a damaged file
-        raise InputError(f"{path} cannot be read as a mesh: {error}.") from error
     if faces.ndim != 2 or len(faces) == 0 or len(vertices) == 0:
         raise InputError(f"{path} holds no triangles (an empty or damaged file).")
     if faces.min() < 0 or faces.max() >= len(vertices):

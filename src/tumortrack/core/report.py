@@ -1,5 +1,5 @@
-"""What an answer says of itself: how well it fits, how sure it is, what speaks against it, or why
-there is none."""
+"""What an answer says of itself: how well it fits, how sure it is, what speaks against it or
+weakens its case, or why there is none."""
 
 from __future__ import annotations
 
@@ -32,14 +32,18 @@ Kind = Literal[
     "few_points", "few_in_range", "sparse", "line", "behind_camera", "pick_missed", "no_picture",
     "no_organ_colour", "spread", "misfit", "implausible", "organ_seen_through", "few_inside",
     "left", "far_off",
+    # What weakens a case.
+    "cut", "thick", "flat", "dropped", "left_out", "beside", "volume",
 ]  # fmt: skip
 
 
 class _Said(msgspec.Struct, forbid_unknown_fields=True):
-    """Of a ``poor`` estimate the check that failed, and the sentence; of ``none`` the sentence."""
+    """Of a ``poor`` estimate the check that failed, and the sentence; of ``none``, and of a weak
+    ``case``, the sentence."""
 
     poor: dict[Kind, tuple[Check, str]]
     none: dict[Kind, str]
+    case: dict[Kind, str]
 
 
 _SAID = read_table("tumortrack.core", "findings.toml", _Said)
@@ -56,19 +60,20 @@ class _WithoutNumbers(string.Formatter):
 
 
 class Finding(msgspec.Struct, frozen=True):
-    """What speaks against an answer, or why there is none: a kind and its values, from which the
-    sentence is made."""
+    """What speaks against an answer, or why there is none, or what weakens a case for good, which
+    every answer repeats: a kind and its values, from which the sentence is made."""
 
     kind: Kind
     values: Mapping[str, float | str | None] = {}
 
     @property
     def check(self) -> Check:
-        return "none" if self.kind in _SAID.none else _SAID.poor[self.kind][0]
+        return _SAID.poor[self.kind][0] if self.kind in _SAID.poor else "none"
 
     @property
     def _sentence(self) -> str:
-        return _SAID.none.get(self.kind) or _SAID.poor[self.kind][1]
+        sentences = _SAID.none | _SAID.case
+        return sentences.get(self.kind) or _SAID.poor[self.kind][1]
 
     @property
     def words(self) -> str:
@@ -84,6 +89,9 @@ class Finding(msgspec.Struct, frozen=True):
     def same_as(self) -> tuple[Kind, object]:
         """Equal for what is the same but for its numbers: the kind, and what was said in words."""
         return self.kind, self.values.get("words")
+
+
+Note = str | Finding  # of how a case was made: in passing, or a weakness
 
 
 class _Value(msgspec.Struct, frozen=True, kw_only=True):

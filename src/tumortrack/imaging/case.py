@@ -9,12 +9,12 @@ from typing import Any, ClassVar, Literal
 import msgspec
 
 from tumortrack.core import store
-from tumortrack.core.case_warning import CaseWarning, warnings_in
-from tumortrack.core.config import to_builtins
+from tumortrack.core.config import findings_in, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.mesh_files import read_anatomy, read_mesh, write_anatomy, write_mesh
 from tumortrack.core.organ import Organ, check_name, organ_entry
 from tumortrack.core.patient import NOBODY, Patient
+from tumortrack.core.report import Finding
 from tumortrack.core.types import Anatomy, LabelVolume, Volume
 from tumortrack.imaging.nifti import write_nifti, write_volume_nifti
 from tumortrack.imaging.volume import read_labels, read_volume
@@ -50,7 +50,7 @@ class Case:
     rotations: Literal["limited", "full"] = "limited"
     tilt_degrees: float = 30.0
     sensor: Literal["d405", "stereo"] = "d405"
-    warnings: tuple[CaseWarning, ...] = ()
+    warnings: tuple[Finding, ...] = ()
     folder: Path | None = None
     sha256: str = ""
 
@@ -88,7 +88,7 @@ def save_case(case: Case, folder: Path) -> None:
         "rotations": case.rotations,
         "tilt_degrees": case.tilt_degrees,
         "sensor": case.sensor,
-        "warnings": [warning.entry for warning in case.warnings],
+        "warnings": msgspec.to_builtins(case.warnings),
         "folders": [case.MODEL],
         "report": case.report,
     }
@@ -111,7 +111,7 @@ def load_case(folder: str | Path) -> Case:
         manifest = msgspec.convert(store.read_manifest(folder, KIND), _Manifest)
         for name in manifest.structures:
             check_name(name, "a structure", "--structure")
-        warnings = warnings_in(manifest.warnings, str(folder))
+        warnings = findings_in(manifest.warnings, str(folder))
     except (InputError, msgspec.ValidationError) as error:
         reason = str(error).rstrip(".")
         raise ArtifactError(

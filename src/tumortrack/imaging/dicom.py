@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -36,6 +36,29 @@ _DEFLATED = "1.2.840.10008.1.2.1.99"  # transfer syntax; pydicom would unpack it
 _AGAIN = "Export the series again."
 
 
+class Plane(NamedTuple):
+    """Of a frame: LPS place of its first pixel; directions (along a row, along a column); spacing
+    between rows and columns; and slope and intercept that make stored numbers HU."""
+
+    position_mm: tuple[float, ...]
+    orientation: tuple[float, ...]
+    spacing_mm: tuple[float, ...]
+    scale: tuple[float, float]
+
+    @property
+    def normal(self) -> np.ndarray:
+        return np.cross(self.orientation[:3], self.orientation[3:])
+
+    def lps_from_index(self, step_mm: np.ndarray) -> Float[np.ndarray, "4 4"]:
+        """Of a stack that begins here; index i runs along a row."""
+        row, column = np.reshape(self.orientation, (2, 3))
+        between_rows, between_columns = self.spacing_mm
+        out = np.eye(4)
+        axes = row * between_columns, column * between_rows, step_mm, self.position_mm
+        out[:3] = np.stack(axes, axis=1)
+        return out
+
+
 @dataclass(frozen=True)
 class _Slice:
     path: Path
@@ -43,12 +66,8 @@ class _Slice:
     description: str
     modality: str
     shape: tuple[int, int]  # rows, columns
-    spacing_mm: tuple[float, float]  # between rows, between columns
-    position_mm: tuple[float, ...]  # LPS, first pixel
-    orientation: tuple[float, ...]  # along a row, along a column
-    scale: tuple[float, float]  # stored number -> HU: slope, intercept
-    samples: int  # per pixel
-    pixel_fault: str  # what is wrong with the length of the pixel data; "": nothing
+    plane: Plane
+    fault: str  # why its numbers can't be HU; "": nothing
     patient_id: str
     laterality: str  # L, R or something else
     frame: int  # of its file
@@ -77,28 +96,23 @@ class Series:
 
 def find_series(folder: Path, series: str | None = None) -> Series:
     """Find one CT series in a folder (sub-folders not searched) without reading its pixels.
-
     ``series``: its UID, or its number in the error's list; None: the only one with modality CT and
     at least 10 slices of one size and orientation. Raises InputError: no series, several, a
-    missing, double or stray slice; images of two patients.
-    """
+    missing, double or stray slice; images of two patients."""
     groups, notes = _groups(folder)
     chosen = _choose(folder, groups, series)
     # With their places, as some anonymisers give all slices one UID.
-    different = [*{(s.instance, s.frame, s.position_mm): s for s in chosen}.values()]
+    different = [*{(s.instance, s.frame, s.plane.position_mm): s for s in chosen}.values()]
     if copies := len(chosen) - len(different):
         notes += (f"{copies} slices are there twice (SOPInstanceUID): one of each is read",)
     first = different[0]
     _check_tags(folder, different)
-    row, column = np.reshape(first.orientation, (2, 3))
-    normal = np.cross(row, column)
+    normal = first.plane.normal
     if not 0.99 < np.linalg.norm(normal) < 1.01:
         raise InputError(f"{first.path}: ImageOrientationPatient is not two unit directions.")
-    slices = sorted(different, key=lambda s: float(np.dot(s.position_mm, normal)))
-    between_rows, between_columns = first.spacing_mm
-    lps_from_index = np.eye(4)  # index i runs along a row
-    axes = (row * between_columns, column * between_rows, _slice_step(slices, normal))
-    lps_from_index[:3] = np.stack([*axes, slices[0].position_mm], axis=1)
+    slices = sorted(different, key=lambda s: float(np.dot(s.plane.position_mm, normal)))
+    start = first.plane._replace(position_mm=slices[0].plane.position_mm)
+    lps_from_index = start.lps_from_index(_slice_step(slices, normal))
     shape = (first.shape[1], first.shape[0], len(slices))
     stored = sum(path.stat().st_size for path in {s.path for s in slices})
     check_size(folder, shape, 4, compressed=True, stored=stored)
@@ -111,7 +125,7 @@ def find_series(folder: Path, series: str | None = None) -> Series:
         notes += ("the slices have no SeriesInstanceUID: taken as one series",)
     files, frames = tuple(s.path for s in slices), tuple(s.frame for s in slices)
     patient = _patient(folder, groups, slices)
-    return Series(files, frames, shape, lps_from_index, first.scale, notes, patient)
+    return Series(files, frames, shape, lps_from_index, first.plane.scale, notes, patient)
 
 
 def _named(names: list[str]) -> str:
@@ -131,8 +145,8 @@ def _patient(folder: Path, groups: list[list[_Slice]], slices: list[_Slice]) -> 
     ids = sorted({s.patient_id for group in groups for s in group} - {""})
     if len(ids) > 1:
         raise InputError(
-            f"{folder} holds images of {len(ids)} patients (PatientID {', '.join(ids[:3])}"
-            f"{', ...' if len(ids) > 3 else ''}). Give a folder that holds one patient's alone."
+            f"{folder} holds images of {len(ids)} patients (PatientID {_named(ids)}). Give a "
+            "folder of one patient alone."
         )
     sides: dict[str, Side] = {"L": "left", "R": "right"}
     stated = {s.laterality for s in slices}
@@ -142,22 +156,13 @@ def _patient(folder: Path, groups: list[list[_Slice]], slices: list[_Slice]) -> 
 
 def _check_tags(folder: Path, slices: list[_Slice]) -> None:
     """Refuse slices that cannot be Hounsfield units; positions are checked in ``_slice_step``."""
-    slope, intercept = np.ptp([s.scale for s in slices], axis=0)
-    if slope > _SAME_SLOPE * abs(slices[0].scale[0]) or intercept > _SAME_HU:
-        raise InputError(
-            f"{folder}: its slices differ in RescaleSlope or RescaleIntercept, so their Hounsfield "
-            f"units are uncertain. {_AGAIN}"
-        )
+    scales = [s.plane.scale for s in slices]
+    slope, intercept = np.ptp(scales, axis=0)
+    if slope > _SAME_SLOPE * abs(scales[0][0]) or intercept > _SAME_HU:
+        raise InputError(f"{folder}: its slices differ in RescaleSlope or Intercept. {_AGAIN}")
     for s in slices:
-        fault = s.pixel_fault
-        if min(s.spacing_mm) <= 0:
-            fault = f"PixelSpacing {s.spacing_mm} must be above 0"
-        elif s.scale[0] <= 0:
-            fault = f"RescaleSlope {s.scale[0]:g} must be above 0"
-        elif s.samples != 1:
-            fault = f"{s.samples} samples a pixel are no CT's, which has 1"
-        if fault:
-            raise InputError(f"{s.path}: {fault}. {_AGAIN}")
+        if s.fault:
+            raise InputError(f"{s.path}: {s.fault}. {_AGAIN}")
 
 
 def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
@@ -176,13 +181,11 @@ def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
         else:
             slices += found
     for tags in slices:
-        file = tags.path
-        numbers = (*tags.position_mm, *tags.orientation, *tags.spacing_mm, *tags.scale)
-        if not np.isfinite(numbers).all():
+        if not np.isfinite(np.concatenate(tags.plane)).all():
             raise InputError(
-                f"{file}: its position, orientation, spacing or rescaling is not finite. {_AGAIN}"
+                f"{tags.path}: its position, orientation, spacing or scale is not finite. {_AGAIN}"
             )
-        key = tags.uid, tags.shape, tags.classic, tags.orientation
+        key = tags.uid, tags.shape, tags.classic, tags.plane.orientation
         same = (
             known
             for known in by_key
@@ -193,10 +196,7 @@ def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
     if not by_key:
         for file in left_out[_NO_SLICE]:
             check_suffix(file)
-        raise NoSeries(
-            f"{folder} holds no DICOM image with a position. Give the folder that holds the CT's "
-            "slices themselves."
-        )
+        raise NoSeries(f"{folder} holds no DICOM image with a position. Give the slices' folder.")
     groups = [by_key[key] for key in sorted(by_key, key=lambda key: (-len(by_key[key]), repr(key)))]
     notes = tuple(
         f"{len(paths)} files are {what}: left out ({_named([p.name for p in paths])})"
@@ -241,37 +241,24 @@ def _read_tags(path: Path) -> list[_Slice] | str:
                 for tag in ("SeriesInstanceUID", "SeriesDescription", "Modality", "PatientID")
             )
             count = int(tags.get("NumberOfFrames") or 1)
-            fault = _pixel_fault(tags, stream, count)
-            slices = []
-            for frame, group in enumerate(frame_groups(tags, count)):
-                plane = group("PixelMeasuresSequence").PixelSpacing
-                position = group("PlanePositionSequence").ImagePositionPatient
-                turn = group("PlaneOrientationSequence").ImageOrientationPatient
-                rescale = group("PixelValueTransformationSequence")
-                slope, intercept = rescale.get("RescaleSlope"), rescale.get("RescaleIntercept")
-                made = _Slice(
+            pixel_fault = _pixel_fault(tags, stream, count)
+            return [
+                _Slice(
                     path,
                     uid,
                     description,
                     modality,
                     shape=(int(tags.Rows), int(tags.Columns)),
-                    spacing_mm=(float(plane[0]), float(plane[1])),
-                    position_mm=_numbers(position, 3),
-                    orientation=_numbers(turn, 6),
-                    scale=(
-                        1.0 if slope is None else float(slope),
-                        0.0 if intercept is None else float(intercept),
-                    ),
-                    samples=int(tags.get("SamplesPerPixel") or 1),
-                    pixel_fault=fault,
+                    plane=(plane := plane_of(group)),
+                    fault=_plane_fault(plane) or pixel_fault,
                     patient_id=patient_id.strip()[:64].strip(),  # as long as the standard allows
                     laterality=str(tags.get("ImageLaterality") or tags.get("Laterality") or ""),
                     frame=frame,
                     instance=str(tags.get("SOPInstanceUID") or path),
                     classic=count == 1,
                 )
-                slices.append(made)
-            return slices
+                for frame, group in enumerate(frame_groups(tags, count))
+            ]
         except Exception as error:  # pydicom raises anything on a foreign or damaged file
             if is_dicom and _should_be_slice(tags):
                 raise InputError(f"{path} is cut short or damaged ({error}). {_AGAIN}") from error
@@ -298,11 +285,29 @@ def frame_groups(tags: Any, count: int) -> Iterator[Callable[[str], Any]]:
         yield partial(group, item)
 
 
-def _numbers(values: Any, count: int) -> tuple[float, ...]:
-    numbers = tuple(float(value) for value in values)
-    if len(numbers) != count:
-        raise ValueError(f"{len(numbers)} numbers where {count} belong")
-    return numbers
+def plane_of(group: Callable[[str], Any]) -> Plane:
+    """From what ``frame_groups`` gives. Raises anything: a tag is missing or damaged."""
+
+    def numbers(sequence: str, tag: str, count: int) -> tuple[float, ...]:
+        values = tuple(map(float, getattr(group(sequence), tag)))
+        if len(values) != count:
+            raise ValueError(f"{tag} has {len(values)} numbers where {count} belong")
+        return values
+
+    rescale = group("PixelValueTransformationSequence")
+    slope, intercept = rescale.get("RescaleSlope"), rescale.get("RescaleIntercept")
+    return Plane(
+        numbers("PlanePositionSequence", "ImagePositionPatient", 3),
+        numbers("PlaneOrientationSequence", "ImageOrientationPatient", 6),
+        numbers("PixelMeasuresSequence", "PixelSpacing", 2),
+        (1.0 if slope is None else float(slope), 0.0 if intercept is None else float(intercept)),
+    )
+
+
+def _plane_fault(plane: Plane) -> str:
+    if min(plane.spacing_mm) <= 0:
+        return f"PixelSpacing {plane.spacing_mm} must be above 0"
+    return f"RescaleSlope {plane.scale[0]:g} must be above 0" if plane.scale[0] <= 0 else ""
 
 
 def _should_be_slice(tags: Any) -> bool:
@@ -314,8 +319,11 @@ def _should_be_slice(tags: Any) -> bool:
 
 
 def _pixel_fault(tags: Any, stream: BinaryIO, frames: int) -> str:
-    """What is wrong with the length of the pixel data, at which the stream stands: decoders pad
-    what is missing and allocate whatever is claimed."""
+    """What is wrong with the kind and length of the pixel data, at which the stream stands:
+    decoders pad what is missing and allocate whatever is claimed."""
+    samples = int(tags.get("SamplesPerPixel") or 1)
+    if samples != 1:
+        return f"{samples} samples a pixel are no CT's, which has 1"
     start, head = stream.tell(), stream.read(12)
     implicit, little = tags.original_encoding
     if head and not implicit and head[4:6] not in (b"OB", b"OW", b"OF", b"OD"):
@@ -323,7 +331,7 @@ def _pixel_fault(tags: Any, stream: BinaryIO, frames: int) -> str:
     size = 8 if implicit else 12  # of the element's head, which ends with the length
     length = int.from_bytes(head[size - 4 : size], "little" if little else "big")
     stored = os.fstat(stream.fileno()).st_size - start - size
-    bits = int(tags.get("BitsAllocated") or 16) * int(tags.get("SamplesPerPixel") or 1)
+    bits = int(tags.get("BitsAllocated") or 16)
     needed = int(tags.Rows) * int(tags.Columns) * bits * frames // 8
     possible = stored * GZIP_BEST if length == _UNDEFINED else min(length, stored)
     if possible >= needed:
@@ -354,12 +362,12 @@ def _choose(folder: Path, groups: list[list[_Slice]], series: str | None) -> lis
 def _slice_step(slices: list[_Slice], normal: np.ndarray) -> np.ndarray:
     """The vector from one slice to the next, after checking that all slices follow it."""
     folder = slices[0].path.parent
-    spacings = [s.spacing_mm for s in slices]
+    spacings = [s.plane.spacing_mm for s in slices]
     if np.ptp(spacings, axis=0).max() > _SAME_SPACING * max(spacings[0]):
         raise InputError(f"{folder}: its slices differ in pixel spacing.")
     if len(slices) < 2:
         raise InputError(f"{folder}: one slice is no volume.")
-    positions = np.array([s.position_mm for s in slices])
+    positions = np.array([s.plane.position_mm for s in slices])
     along = positions @ normal
     gaps = np.diff(along)
     usual = float(np.median(gaps))
@@ -368,15 +376,12 @@ def _slice_step(slices: list[_Slice], normal: np.ndarray) -> np.ndarray:
         kind = "two slices lie at" if doubled else "a slice is missing after"
         raise InputError(
             f"{folder}: {kind} position {along[n]:.2f} mm ({slices[n].path.name} to "
-            f"{slices[n + 1].path.name}: {gaps[n]:.2f} mm, usually {usual:.2f} mm). Export the "
-            "whole series again, each slice once."
+            f"{slices[n + 1].path.name}: {gaps[n]:.2f} mm, usually {usual:.2f} mm). {_AGAIN}"
         )
     step = (positions[-1] - positions[0]) / (len(slices) - 1)
     line = positions[0] + np.arange(len(slices))[:, None] * step
     off_mm = np.linalg.norm(positions - line, axis=1)
     if off_mm.max() > max(0.1, 0.1 * abs(usual)):
-        raise InputError(
-            f"{slices[int(off_mm.argmax())].path}: this slice lies {off_mm.max():.2f} mm off the "
-            "line through the others. Export one continuous series."
-        )
+        stray = slices[int(off_mm.argmax())].path
+        raise InputError(f"{stray} lies {off_mm.max():.2f} mm off the others' line. {_AGAIN}")
     return step

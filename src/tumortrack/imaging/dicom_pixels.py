@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float, Integer
 
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import readable
 
 if TYPE_CHECKING:
     from pydicom import Dataset
@@ -58,16 +58,11 @@ def read_pixels(
         warnings.filterwarnings("error", "The decoded RLE segment contains")
         tags, last = None, None
         for file, frame, out in zip(files, frames, values, strict=True):
-            try:
+            with readable(file, "has pixels that cannot be decoded"):
                 tags, last = tags if file == last and tags else _tags(file), file
                 stored = _stored(tags, frame)
                 if stored.shape != out.shape:
                     raise ValueError(f"they are {stored.shape}, the other slices' {out.shape}")
-            except Exception as error:  # pydicom and its decoders raise anything
-                reason = (str(error).strip().splitlines() or [type(error).__name__])[-1]
-                raise InputError(
-                    f"{file}: the slice's pixels cannot be decoded: {reason.strip().rstrip('.')}."
-                ) from error
             out[...] = stored * scale[0] + scale[1]  # in double precision
     return values.transpose(2, 1, 0)
 
@@ -93,10 +88,7 @@ def _stored(tags: Dataset, index: int) -> Integer[np.ndarray, "rows columns"]:
     tags.setdefault("PhotometricInterpretation", "MONOCHROME2")
     photometric = tags.PhotometricInterpretation
     if photometric != "MONOCHROME2":  # some readers invert MONOCHROME1 and others do not
-        raise ValueError(
-            f"PhotometricInterpretation {photometric!s:.20} is read by no one rule, only "
-            "MONOCHROME2"
-        )
+        raise ValueError(f"PhotometricInterpretation {photometric!s:.20} is not MONOCHROME2")
     high_bit, bits = tags.get("HighBit"), tags.BitsStored
     if high_bit not in (None, bits - 1):
         raise ValueError(f"HighBit {high_bit} does not fit BitsStored {bits}")
@@ -105,9 +97,8 @@ def _stored(tags: Dataset, index: int) -> Integer[np.ndarray, "rows columns"]:
     if syntax.is_encapsulated and syntax != RLELossless:
         _silence_gdcm()
         plugin = "gdcm"
-        frame = get_frame(
-            tags.PixelData, index, number_of_frames=int(tags.get("NumberOfFrames") or 1)
-        )
+        count = int(tags.get("NumberOfFrames") or 1)
+        frame = get_frame(tags.PixelData, index, number_of_frames=count)
         is_j2k = syntax in JPEG2000TransferSyntaxes
         _check_picture(_j2k_header(frame) if is_j2k else _jpeg_header(frame, syntax), tags)
     return get_decoder(syntax).as_array(tags, index=index, raw=True, decoding_plugin=plugin)[0]

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from tumortrack.core.errors import InputError
-from tumortrack.imaging.dicom import frame_groups, is_segmentation
+from tumortrack.core.errors import InputError, readable
+from tumortrack.imaging.dicom import frame_groups, is_segmentation, plane_of
 from tumortrack.imaging.grid import RawVolume, Segment, check_affine, check_size
 from tumortrack.imaging.segments import painted
 
@@ -28,29 +28,20 @@ def read_segmentation(path: Path) -> RawVolume | None:
         return None
     import pydicom
 
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return _read(path, pydicom.dcmread(path))
-    except InputError:
-        raise
-    except Exception as error:  # pydicom raises anything on a damaged file
-        raise InputError(f"{path} is cut short or damaged ({error}). Export it again.") from error
+    with readable(path, "is cut short or damaged"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return _read(path, pydicom.dcmread(path))
 
 
 def _read(path: Path, tags: Any) -> RawVolume:
     if tags.SegmentationType != "BINARY":
         raise InputError(f"{path}: its segments are {tags.SegmentationType}; BINARY is read.")
     groups = list(frame_groups(tags, int(tags.NumberOfFrames)))
-    positions = np.array([g("PlanePositionSequence").ImagePositionPatient for g in groups], float)
-    row, column = np.reshape(
-        np.array(groups[0]("PlaneOrientationSequence").ImageOrientationPatient, float), (2, 3)
-    )
-    measures = groups[0]("PixelMeasuresSequence")
-    normal = np.cross(row, column)
+    planes = [plane_of(group) for group in groups]
+    positions, normal = np.array([plane.position_mm for plane in planes]), planes[0].normal
     along = positions @ normal
     gaps = np.diff(np.unique(np.round(along, 3)))
-    step = float(gaps.min() if len(gaps) else measures.SliceThickness)
+    step = float(gaps.min() if len(gaps) else groups[0]("PixelMeasuresSequence").SliceThickness)
     slices = (along - along.min()) / step
     first, last = positions[along.argmin()], positions[along.argmax()]
     between = (last - first) / max(round(float(slices.max())), 1) if len(gaps) else normal * step
@@ -58,10 +49,7 @@ def _read(path: Path, tags: Any) -> RawVolume:
     if max(np.abs(slices - np.rint(slices)).max(), off_line.max() / step) > _OFF_STEP:
         raise InputError(f"{path}: its slices have no common step. Export it again, or as NIfTI.")
     index = np.rint(slices).astype(int) + 1
-    lps_from_index = np.eye(4)
-    between_rows, between_columns = map(float, measures.PixelSpacing)
-    axes = row * between_columns, column * between_rows, between
-    lps_from_index[:3] = np.stack([*axes, first - between], axis=1)
+    lps_from_index = planes[0]._replace(position_mm=first - between).lps_from_index(between)
     shape = int(tags.Columns), int(tags.Rows), int(index.max()) + 2
     names = {int(s.SegmentNumber): str(s.SegmentLabel) for s in tags.SegmentSequence}
     numbers = [int(g("SegmentIdentificationSequence").ReferencedSegmentNumber) for g in groups]

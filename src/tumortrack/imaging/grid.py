@@ -76,8 +76,7 @@ def check_size(
     dims = " x ".join(str(n) for n in shape)
     if len(shape) != 3:
         raise InputError(
-            f"{path} has {len(shape)} axes ({dims}); one 3-D volume is needed. Export a single "
-            "phase or channel."
+            f"{path} has {len(shape)} axes ({dims}). Export a single phase or channel."
         )
     if min(shape) < 2:
         raise InputError(f"{path} is {dims} voxels: a flat image. Give a whole 3-D volume.")
@@ -86,7 +85,7 @@ def check_size(
     if voxels > _MAX_VOXELS or needed > _MAX_BYTES:
         raise InputError(
             f"{path} claims {dims} voxels of {bytes_per_voxel} bytes; the limit is {_MAX_VOXELS} "
-            "voxels and 8 GiB. Crop or resample the volume round the organ."
+            "voxels and 8 GiB. Crop it round the organ."
         )
     stored = path.stat().st_size if stored is None else stored
     if compressed and needed > _MUCH and _USUAL_BEST * stored < needed <= GZIP_BEST * stored:
@@ -95,10 +94,7 @@ def check_size(
             "scan does. Crop it round the organ, or store it as 8-bit or 16-bit numbers."
         )
     if stored * (GZIP_BEST if compressed else 1) < needed:
-        raise InputError(
-            f"{path} is shorter than its header says ({needed} bytes of voxels): truncated "
-            "or damaged. Copy or export it again."
-        )
+        raise InputError(f"{path} is shorter than its header says ({needed} bytes of voxels).")
 
 
 @contextmanager
@@ -138,22 +134,25 @@ def check_affine(path: Path, lps_from_index: Float[np.ndarray, "4 4"]) -> None:
         raise InputError(f"{path}: the affine puts voxels kilometres away. Export it again.")
     steps = spacing_mm(lps_from_index)
     if min(steps) <= 0 or abs(np.linalg.det(linear / np.where(steps > 0, steps, 1))) < 0.1:
-        raise InputError(
-            f"{path}: the affine is singular (its axes do not span space). Export it again."
-        )
+        raise InputError(f"{path}: the affine is singular. Export it again.")
     low, high = _SPACING_RANGE_MM
     if min(steps) < low or max(steps) > high:
         text = " x ".join(f"{s:.6g}" for s in steps)
-        hint = "Correct the header and export again."
-        if low <= 1000 * min(steps) and 1000 * max(steps) <= high:
-            hint = "This looks like metres: multiply the spacing by 1000 and export again."
+        is_metres = low <= 1000 * min(steps) and 1000 * max(steps) <= high
         raise InputError(
-            f"{path}: voxels of {text} mm; allowed are {low:g} to {high:g} mm on each axis. {hint}"
+            f"{path}: voxels of {text} mm; allowed are {low:g} to {high:g} mm. Correct the "
+            f"header{': it looks like metres' if is_metres else ''}, and export it again."
         )
 
 
 def voxel_ml(lps_from_index: Float[np.ndarray, "4 4"]) -> float:
     return float(abs(np.linalg.det(lps_from_index[:3, :3]))) / 1000
+
+
+def face_areas_mm2(lps_from_index: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, " 3"]:
+    """Of a voxel's faces across each axis."""
+    i, j, k = lps_from_index[:3, :3].T
+    return np.linalg.norm([np.cross(j, k), np.cross(k, i), np.cross(i, j)], axis=1)
 
 
 def label_counts(labels: UInt8[np.ndarray, "i j k"]) -> Int64[np.ndarray, " 256"]:

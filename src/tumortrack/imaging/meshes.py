@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from tumortrack.core.case_warning import CaseWarning
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, transform_points
 from tumortrack.core.mesh_files import SUFFIXES, read_mesh
 from tumortrack.core.organ import KIDNEY, Organ
+from tumortrack.core.report import Finding, Note
 from tumortrack.core.store import natural
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, Anatomy, LabelVolume, Mesh, part_names
 from tumortrack.imaging.grid import grid_round
@@ -40,7 +40,7 @@ def read_meshes(
     unit: str | None = None,
     kind: Organ = KIDNEY,
     min_tumor_ml: float = MIN_TUMOR_ML,
-) -> tuple[Anatomy, list[str]]:
+) -> tuple[Anatomy, list[Note]]:
     """Read one organ and its tumors, LPS mm, from the meshes among files; and notes on every
     change.
 
@@ -53,7 +53,7 @@ def read_meshes(
     if unit not in (None, "mm", "m"):
         raise InputError(f"unit {unit!r} is not allowed: mm or m.")
     files = _files_by_name(paths, kind.name)
-    notes: list[str] = []
+    notes: list[Note] = []
     meshes = [read_lps(file, 1000.0 if unit == "m" else 1.0, notes) for file in files]
     _check_unit(files[0], meshes[0], unit)
     parts: list[Mesh] = []
@@ -76,13 +76,12 @@ def read_meshes(
     return Anatomy(tuple(parts), kind), notes
 
 
-def _dropped(name: str, pieces_ml: list[float]) -> list[str]:
-    large: list[str] = [
-        CaseWarning("dropped", what=name, ml=ml) for ml in pieces_ml if ml >= LEAST_DROPPED_ML
-    ]
+def _dropped(name: str, pieces_ml: list[float]) -> list[Note]:
+    large = [ml for ml in pieces_ml if ml >= LEAST_DROPPED_ML]
+    notes: list[Note] = [Finding("dropped", {"what": name, "ml": ml}) for ml in large]
     specks = [ml for ml in pieces_ml if ml < LEAST_DROPPED_ML]
     words = f"{name}: {len(specks)} specks of together {sum(specks):.3f} ml dropped"
-    return [*large, words] if specks else large
+    return [*notes, words] if specks else notes
 
 
 def label_meshes(anatomy: Anatomy) -> LabelVolume:
@@ -110,7 +109,7 @@ def _files_by_name(paths: Sequence[Path], organ: str) -> list[Path]:
     return [*organs, *tumors]
 
 
-def read_lps(path: Path, scale: float, notes: list[str]) -> Mesh:
+def read_lps(path: Path, scale: float, notes: list[Note]) -> Mesh:
     """A mesh file in LPS, its vertices times ``scale``; a conversion from RAS is noted. Raises
     InputError: not a mesh, or an unknown frame."""
     mesh = read_mesh(path)
@@ -144,12 +143,9 @@ def _check_unit(path: Path, organ: Mesh, unit: str | None) -> None:
     if low <= extent <= high:
         return
     if unit != "m" and low <= 1000 * extent <= high:
-        raise InputError(
-            f"{path} is {extent:.3g} mm long: it looks like metres. Give --unit m to convert."
-        )
+        raise InputError(f"{path} is {extent:.3g} mm long: it looks like metres. Give --unit m.")
     raise InputError(
-        f"{path} is {extent:.4g} mm long; an organ has {low:g} to {high:g} mm. Check its unit"
-        + (" (--unit m multiplied it by 1000)." if unit == "m" else ".")
+        f"{path} is {extent:.4g} mm long; an organ has {low:g} to {high:g} mm. Check its unit."
     )
 
 
@@ -160,13 +156,12 @@ def _union(organ: Mesh, tumor: Mesh, name: str) -> Mesh:
     outer.sort(key=lambda shell: -shell.volume())
     if not outer or (len(outer) > 1 and outer[1].volume() > 0.01 * tumor.volume_mm3):
         raise InputError(
-            f"{name} lies apart from the organ: a tumor must lie in it or touch it. Check that "
-            "all meshes share one frame and unit."
+            f"{name} lies apart from the organ. Check that all meshes share one frame and unit."
         )
     return largest_shell(mesh_of(outer[0]))
 
 
-def closed_mesh(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
+def closed_mesh(mesh: Mesh, name: str, notes: list[Note]) -> Mesh:
     """Repair a mesh and note each change: doubled faces are removed, holes up to 10 mm closed and
     faces turned outward; a mesh that crosses itself is remeshed from its winding numbers. Raises
     InputError: still open, or not a surface."""
@@ -186,10 +181,7 @@ def closed_mesh(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
         out = Mesh(out.vertices_mm, np.asarray(work.faces))
     out = _close_holes(out, name, notes)
     if not trimesh.Trimesh(out.vertices_mm, out.faces, process=False).is_watertight:
-        raise InputError(
-            f"{name} is not a closed surface (edges with one or more than two faces). Repair it, "
-            "for instance with Blender's 3D-Print toolbox, or give a label map."
-        )
+        raise InputError(f"{name} is not a closed surface. Repair it, or give a label map.")
     if out.volume_mm3 < 0:
         out = Mesh(out.vertices_mm, out.faces[:, ::-1])
         notes.append(f"{name}: it was inside out; faces turned outward")
@@ -200,7 +192,9 @@ def closed_mesh(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
             bodies[n] = Mesh(body.vertices_mm, body.faces[:, ::-1])
             notes.append(f"{name}: a piece of {bodies[n].volume_ml:.2f} ml was inside out; turned")
     _check_nested(bodies, name)
-    out = _together(bodies)
+    starts = np.cumsum([0, *(len(body.vertices_mm) for body in bodies)])
+    faces = [body.faces + start for body, start in zip(bodies, starts, strict=False)]
+    out = Mesh(np.concatenate([b.vertices_mm for b in bodies]), np.concatenate(faces))
     if abs(out.volume_mm3) < 1e-9 * size**3:
         raise InputError(f"{name} encloses no volume; it is no solid.")
     if not is_simple(out, size / 80):
@@ -217,20 +211,11 @@ def _check_nested(bodies: list[Mesh], name: str) -> None:
             continue
         both = solid_of(outer, name) ^ solid_of(inner, name)
         if both.volume() > 0.9 * inner.volume_mm3:
-            raise InputError(
-                f"{name} holds a body of {inner.volume_ml:.2f} ml within another one. Give each "
-                "part as a file of its own, tumors with tumor in their names."
-            )
+            ml = f"{inner.volume_ml:.2f} ml"
+            raise InputError(f"{name} holds {ml} within another body. Give each part its own file.")
 
 
-def _together(bodies: list[Mesh]) -> Mesh:
-    """Several meshes as one."""
-    starts = np.cumsum([0, *(len(body.vertices_mm) for body in bodies)])
-    faces = [body.faces + start for body, start in zip(bodies, starts[:-1], strict=True)]
-    return Mesh(np.concatenate([b.vertices_mm for b in bodies]), np.concatenate(faces))
-
-
-def _close_holes(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
+def _close_holes(mesh: Mesh, name: str, notes: list[Note]) -> Mesh:
     """Close every boundary loop by a fan about its centre, if all are small."""
     edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     n = len(mesh.vertices_mm)
@@ -258,7 +243,7 @@ def _close_holes(mesh: Mesh, name: str, notes: list[str]) -> Mesh:
     if widest > _LARGEST_HOLE_MM:
         raise InputError(
             f"{name} is open: {len(centres)} holes, the widest {widest:.1f} mm (up to "
-            f"{_LARGEST_HOLE_MM:g} mm are closed). Close the mesh, or give a label map."
+            f"{_LARGEST_HOLE_MM:g} mm are closed). Close them, or give a label map."
         )
     notes.append(f"{name}: {len(centres)} holes closed, the widest {widest:.1f} mm")
     return Mesh(np.concatenate([mesh.vertices_mm, centres]), np.concatenate(faces))
@@ -296,10 +281,8 @@ def solid_of(mesh: Mesh, name: str) -> Any:
     raw = manifold3d.Mesh64(mesh.vertices_mm.copy(), mesh.faces.astype(np.uint64))
     solid = manifold3d.Manifold(raw)
     if solid.status() != manifold3d.Error.NoError or solid.volume() <= 0:
-        raise InputError(
-            f"{name} is not a closed surface with faces turned outward "
-            f"({solid.status().name}). Repair the mesh and try again."
-        )
+        status = solid.status().name
+        raise InputError(f"{name} is no closed surface with faces outward ({status}). Repair it.")
     return solid
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Num
 
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, readable
 from tumortrack.core.geometry import RAS_FROM_LPS, spacing_mm
 from tumortrack.core.pydicom_library import load_pydicom
 from tumortrack.core.store import write_atomically
@@ -69,7 +69,7 @@ def _read(path: Path, stream: BufferedIOBase, compressed: bool) -> grid.RawVolum
     size = next((size for size in sizes if size in kinds), None)
     if size is None:
         raise InputError(f"{path} is no NIfTI file (its header has {sizes[0]} bytes, not 348).")
-    try:
+    with readable(path, "cannot be read as NIfTI"):
         header = kinds[size](head[:size], check=False)
         header.check_fix(logger=_SILENT)
         shape = tuple(int(n) for n in header.get_data_shape())
@@ -79,26 +79,17 @@ def _read(path: Path, stream: BufferedIOBase, compressed: bool) -> grid.RawVolum
         stored_scale = [header["scl_slope"], header["scl_inter"]]
         magic = bytes(header["magic"].tobytes())
         slope, intercept = header.get_slope_inter()
-    except Exception as error:  # nibabel raises anything on a damaged file
-        raise InputError(f"{path} cannot be read as NIfTI: {error}.") from error
     if magic[:3] not in (b"n+1", b"n+2"):
-        raise InputError(
-            f"{path}: its voxels lie in another file (magic {magic!r}); detached data are refused. "
-            "Export one .nii or .nii.gz file."
-        )
+        raise InputError(f"{path}: its voxels lie in another file. Export one .nii or .nii.gz.")
     if not (math.isfinite(offset) and size <= offset <= _MAX_OFFSET):
         raise InputError(f"{path}: the header puts the voxels at byte {offset:g}; it is damaged.")
     while len(shape) > 3 and shape[-1] == 1:
         shape = shape[:-1]
     grid.check_size(path, shape, dtype.itemsize, compressed)
     if dtype.kind not in "iuf":
-        raise InputError(
-            f"{path}: voxels are {dtype}; a CT or a label map of plain numbers is needed."
-        )
+        raise InputError(f"{path}: voxels are {dtype}; plain numbers are needed.")
     if units not in ("mm", "unknown"):
-        raise InputError(
-            f"{path} states its unit as {units}; millimetres are needed. Export it in mm."
-        )
+        raise InputError(f"{path} states its unit as {units}. Export it in mm.")
     lps_from_index = _lps_from_index(path, header)
     grid.check_affine(path, lps_from_index)
     # Both NaN means unscaled: so nibabel keeps the header of an image that it has scaled.
@@ -113,16 +104,11 @@ def _read(path: Path, stream: BufferedIOBase, compressed: bool) -> grid.RawVolum
 
 def _lps_from_index(path: Path, header: Any) -> Float[np.ndarray, "4 4"]:
     """The affine that the header states; never a guess, which might mirror the patient."""
-    try:
+    with readable(path, "has an orientation that cannot be read"):
         sform, sform_code = header.get_sform(coded=True)
         qform, qform_code = header.get_qform(coded=True)
-    except Exception as error:
-        raise InputError(f"{path}: its orientation cannot be read: {error}.") from error
     if not sform_code and not qform_code:
-        raise InputError(
-            f"{path} states no orientation (sform and qform codes are 0), so left and right are "
-            "unknown. Export it again with its orientation."
-        )
+        raise InputError(f"{path} states no orientation (sform, qform). Export it again with it.")
     if sform_code and qform_code:
         with np.errstate(all="ignore"):
             steps = [np.linalg.norm(a[:3, :3], axis=0) for a in (sform, qform)]
@@ -131,17 +117,12 @@ def _lps_from_index(path: Path, header: Any) -> Float[np.ndarray, "4 4"]:
             agree = any((np.sum(s * q, axis=0) > math.cos(_SAME_TURN)).all() for s in forms)
             equal = np.allclose(steps[0], steps[1], rtol=_EQUAL_STEPS, atol=0)
             apart_mm = np.linalg.norm(sform[:3, 3] - qform[:3, 3])
-        if not agree:
+        if not (agree and equal and apart_mm <= max(steps[0])):
+            voxels = " and ".join(" x ".join(f"{mm:.4g}" for mm in step) for step in steps)
+            what = "affines" if agree else "orientations"
             raise InputError(
-                f"{path}: its two orientations (sform and qform) disagree, so left and right are "
-                "uncertain. Export it again from the DICOM series."
-            )
-        if not (equal and apart_mm <= max(steps[0])):
-            raise InputError(
-                f"{path}: its two affines (sform and qform) disagree: voxels of "
-                f"{' x '.join(f'{step:.4g}' for step in steps[0])} and "
-                f"{' x '.join(f'{step:.4g}' for step in steps[1])} mm, origins {apart_mm:.4g} mm "
-                "apart. Export it again from the DICOM series."
+                f"{path}: its two {what} (sform, qform) disagree: voxels of {voxels} mm, origins "
+                f"{apart_mm:.4g} mm apart. Export it again from the DICOM series."
             )
     return RAS_FROM_LPS @ np.asarray(sform if sform_code else qform, np.float64)
 

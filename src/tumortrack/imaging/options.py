@@ -88,8 +88,7 @@ class PrepareOptions:
         direction_lps(self.up)
         if not 0 <= self.tilt <= _MOST_TILTED:
             raise InputError(
-                f"tilt is {self.tilt:g} degrees; allowed: 0 to {_MOST_TILTED:g}. An organ that may "
-                "lie in any way has rotations full."
+                f"tilt is {self.tilt:g} degrees; allowed: 0 to {_MOST_TILTED:g}, or rotations full."
             )
         for name, allowed in _ALLOWED.items():
             if (value := getattr(self, name)) not in allowed:

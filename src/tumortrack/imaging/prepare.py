@@ -13,15 +13,21 @@ import numpy as np
 from scipy import ndimage
 
 from tumortrack.core import store
-from tumortrack.core.case_warning import CaseWarning
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import direction_lps, spacing_mm
 from tumortrack.core.mesh_files import SUFFIXES
 from tumortrack.core.organ import Organ
 from tumortrack.core.patient import UNKNOWN, Patient, Side
+from tumortrack.core.report import Finding, Kind, Note
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case
-from tumortrack.imaging.grid import check_suffix, grown_box, label_counts, voxel_ml
+from tumortrack.imaging.grid import (
+    check_suffix,
+    face_areas_mm2,
+    grown_box,
+    label_counts,
+    voxel_ml,
+)
 from tumortrack.imaging.hu_windows import segment_ct
 from tumortrack.imaging.meshes import LEAST_DROPPED_ML, label_meshes, read_meshes
 from tumortrack.imaging.options import PrepareOptions, parse_structures
@@ -32,12 +38,11 @@ from tumortrack.imaging.surface import surfaces
 from tumortrack.imaging.symmetry import ambiguous, half_turns, warning
 from tumortrack.imaging.volume import (
     MOST_LABELS,
-    is_dicom,
     is_label_map,
     is_volume,
     label_map,
+    read_files,
     read_raw,
-    read_several,
     volume_of,
 )
 
@@ -70,8 +75,8 @@ def prepare(input: Path | Sequence[Path], options: PrepareOptions | None = None)
         is_meshes = any(path.suffix.lower() in SUFFIXES for path in files)
         if is_meshes and (volumes := [path.name for path in files if is_volume(path)]):
             raise InputError(
-                f"{', '.join(volumes[:3])} lies beside meshes. Give the parts either all as meshes "
-                "or all as label files."
+                f"{', '.join(volumes[:3])} lies beside meshes. Give all parts as meshes, or all as "
+                "label files."
             )
         for path in files if is_meshes or len(paths) > 1 else []:
             check_suffix(path)
@@ -95,12 +100,12 @@ def prepare(input: Path | Sequence[Path], options: PrepareOptions | None = None)
             "warning": text,
             "turns": [{k: v for k, v in asdict(t).items() if k != "ct_from_ct"} for t in turns],
         },
-        "notes": [n for n in (*notes, text) if n and not isinstance(n, CaseWarning)],
+        "notes": [note for note in (*notes, text) if note and isinstance(note, str)],
     }
     return replace(
         case,
         report=report,
-        warnings=tuple(note for note in notes if isinstance(note, CaseWarning)),
+        warnings=tuple(note for note in notes if isinstance(note, Finding)),
         rotations=options.rotations,
         tilt_degrees=options.tilt,
         sensor=options.sensor,
@@ -114,10 +119,7 @@ def _files_in(paths: list[Path]) -> list[Path]:
     files = [p for path in paths for p in (path.iterdir() if path.is_dir() else [path])]
     files = [path for path in files if path.is_file() and not path.name.startswith(".")]
     if not files and paths[0].is_dir():
-        raise InputError(
-            f"{paths[0]} holds no files. Give a folder of DICOM slices, of meshes, or of label "
-            "files with one structure each."
-        )
+        raise InputError(f"{paths[0]} holds no files. Give one of slices, meshes or label files.")
     return sorted(files, key=store.natural)
 
 
@@ -128,10 +130,7 @@ def _with_structures(case: Case, options: PrepareOptions) -> Case:
     from_files, notes = read_structures(others, options.unit)
     structures = {**case.anatomy.structures, **from_files}
     if missing := [name for name in sources if name not in structures]:
-        raise InputError(
-            f"--structure {missing[0]}={sources[missing[0]]}: a number is a label of a label map, "
-            "and this is none. Give a mesh."
-        )
+        raise InputError(f"--structure {missing[0]}: without a label map it takes a mesh's file.")
     extents, more = extent_report(structures, case.anatomy, case.labels)
     report = {**case.report, "notes": [*case.report["notes"], *notes, *more]}
     anatomy = replace(case.anatomy, structures=structures)
@@ -145,8 +144,8 @@ def _check_organ_outside(labels: LabelVolume) -> None:
     share = np.count_nonzero(outermost == ORGAN) / max(len(outermost), 1)
     if share < _LEAST_ORGAN_OUTSIDE:
         raise InputError(
-            f"tumors make up {1 - share:.0%} of the outer surface: they enclose the organ. Check "
-            "which part is the organ and which the tumor, and that all have one frame and unit."
+            f"tumors make up {1 - share:.0%} of the outer surface. Check which part is the organ, "
+            "and that all have one frame and unit."
         )
 
 
@@ -155,8 +154,7 @@ def _large_tumors(case: Case) -> list[str]:
     voxels = np.bincount(case.labels.labels.reshape(-1))
     shares = voxels[FIRST_TUMOR:] / voxels[ORGAN:].sum()
     return [
-        f"{name} takes {share:.0%} of organ and tumors together: are their labels swapped "
-        "(--organ and --tumor, or the meshes' names)? Look at qc.png"
+        f"{name} takes {share:.0%} of organ and tumors together: are they swapped? Look at qc.png"
         for name, share in zip(case.anatomy.names[1:], shares, strict=True)
         if share > _LARGEST_SHARE
     ]
@@ -172,24 +170,16 @@ def refuse_unused(what: str, options: PrepareOptions, *unused: str) -> None:
 
 
 def _from_volume(paths: list[Path], files: list[Path], options: PrepareOptions) -> Case:
-    path = paths[0]
+    path, kind = paths[0], options.kind
     if not path.is_dir():
         refuse_unused(f"{path} is one file", options, "series")
-    volumes = [file for file in files if is_volume(file)]
-    others = [file for file in files if not is_volume(file)]
-    several = len(paths) > 1 or (path.is_dir() and volumes and not any(map(is_dicom, others)))
-    if several:
-        raw = read_several(volumes if path.is_dir() else files)
-    else:
-        raw = read_raw(path, options.series)
+    raw = read_files(paths, files, options.series)
     stated = bool(options.organs) or options.tumors is not None
     most = 256 if stated else MOST_LABELS  # kinds of voxels
     is_labels = bool(raw.segments) or (path.is_file() and is_label_map(raw, most))
     as_labels = options.labels or is_labels
     structures: dict[str, Mesh] = {}
-    ct, notes = None, list(raw.notes)
-    if several and path.is_dir() and others:
-        notes.append(f"no label files, left out: {', '.join(f.name for f in others[:5])}")
+    ct, notes = None, list[Note](raw.notes)
     file_patient, side = raw.patient, options.stated_side
     shape, affine = raw.array.shape, raw.lps_from_index
     if as_labels:
@@ -200,54 +190,51 @@ def _from_volume(paths: list[Path], files: list[Path], options: PrepareOptions) 
         source = label_map(raw, parts, path)
         del raw  # the largest maps are gigabytes: one copy is enough
         labels, structures, more, side = _selected(source, parts, path, options)
+        notes += more
     else:
         what = f"{path} is read as a CT (a label map needs --labels)"
         refuse_unused(what, options, *OF_LABELS, "unit")
         volume = volume_of(raw, path)
         del raw
-        labels, more = segment_ct(
-            volume, options.organ_hu, options.tumor_hu, options.min_tumor_ml, options.kind
-        )
-        ct = crop_ct(volume, labels)
-        thickest_mm = float(spacing_mm(affine).max())
-        more += [CaseWarning("thick", mm=thickest_mm)] if thickest_mm > _THICK_MM else []
-    cut = _cut(options.kind.words, labels, shape, affine)
-    notes += [*more, *(cut or _flat(options.kind.words, labels))]
-    anatomy, surface = surfaces(labels, options.kind)
+        windows = options.organ_hu, options.tumor_hu
+        labels, of_ct = segment_ct(volume, *windows, options.min_tumor_ml, kind)
+        ct, thickest_mm = crop_ct(volume, labels), float(spacing_mm(affine).max())
+        notes += [*of_ct, *_where(thickest_mm > _THICK_MM, "thick", mm=thickest_mm)]
+    notes += _cut(kind.words, labels, shape, affine) or _flat(kind.words, labels)
+    anatomy, surface = surfaces(labels, kind)
     anatomy = replace(anatomy, structures=structures)
-    notes += [
-        CaseWarning("dropped", what=part, ml=ml)
-        for part, ml in zip(surface["names"], surface["dropped_ml"], strict=True)
-        if ml > LEAST_DROPPED_ML
-    ]
-    notes += [
-        f"{part}: the surface's volume is {change:+.1f} % off its labels'; it is too thin or hangs "
-        "together by too little for a smooth surface. Look at qc.png"
-        for part, change in zip(surface["names"], surface["change_percent"], strict=True)
-        if abs(change) > _MOST_CHANGE_PERCENT
-    ]
+    columns = (surface[name] for name in ("names", "dropped_ml", "change_percent"))
+    for part, ml, change in zip(*columns, strict=True):
+        notes += _where(ml > LEAST_DROPPED_ML, "dropped", what=part, ml=ml)
+        if abs(change) > _MOST_CHANGE_PERCENT:
+            notes.append(
+                f"{part}: the surface's volume is {change:+.1f} % off its labels'; it is too thin "
+                "or hangs together by too little for a smooth surface. Look at qc.png"
+            )
     measured = _measured(labels, anatomy, surface)
-    notes += _unusual(options.kind, measured)
+    notes += _unusual(kind, measured)
     report = {"kind": "label map" if as_labels else "ct", "notes": notes, **measured}
     patient = patient_of(path, file_patient, options.patient, side)
     return Case(anatomy, labels, direction_lps(options.up), report, ct, patient)
 
 
+def _where(holds: bool, kind: Kind, **values: float | str) -> list[Finding]:
+    return [Finding(kind, values)] if holds else []
+
+
 def _selected(
     volume: LabelVolume, parts: Parts, path: Path, options: PrepareOptions
-) -> tuple[LabelVolume, dict[str, Mesh], list[str], Side]:
+) -> tuple[LabelVolume, dict[str, Mesh], list[Note], Side]:
     """The organ and its tumors, structures, notes, and the organ's side."""
     counts, organ, tumors = label_counts(volume.labels), parts.organ[0], parts.tumors
     if tumors and options.tumors is None:  # tools also write segments that hold nothing
         tumors = tuple(n for n in tumors if counts[n])
     if np.count_nonzero(counts[1:]) == 1 and is_tumor(path.name.split(".")[0]):
-        raise InputError(
-            f"{path} is a tumor by its name, and holds nothing else. Give the organ's file as well."
-        )
+        raise InputError(f"{path} is a tumor by its name. Give the organ's file as well.")
     if not (parts.names or options.organs) and (other := other_organ(path.name, options.name)):
         raise InputError(
-            f"{path} is of a {other} by its name, and no label says what it is. Give --name "
-            f"{other}, or --organ NUMBER of the {options.kind.words}."
+            f"{path} is of a {other} by its name. Give --name {other}, or --organ NUMBER of the "
+            f"{options.kind.words}."
         )
     used = organ, *(np.arange(FIRST_TUMOR, 256) if tumors is None else tumors)
     _check_every_slice(np.isin(volume.labels, used), volume.lps_from_index, path)
@@ -257,33 +244,30 @@ def _selected(
     around = _on_grid(source.labels, source.lps_from_index, chosen, 0)
     shares = neighbours(around, chosen.labels, used)
     ml = counts * voxel_ml(volume.lps_from_index)
-    enclosed = [n for n, share in shares.items() if share > _ENCLOSED and n not in parts.names]
-    if enclosed and options.tumors is None:
-        raise InputError(
-            f"{path}: the organ encloses label {enclosed[0]} ({ml[enclosed[0]]:.1f} ml), and "
-            f"nothing says what it is. Give --tumor {enclosed[0]}, --organ {enclosed[0]} as well "
-            "if it is part of the organ, or --tumor 0 if there is no tumor."
-        )
-    beside = {n: f" {parts.names[n]}" if n in parts.names else "" for n in shares}
-    notes += [CaseWarning("beside", label=n, name=beside[n], ml=float(ml[n])) for n in shares]
+    for n, share in shares.items():
+        if share > _ENCLOSED and n not in parts.names and options.tumors is None:
+            raise InputError(
+                f"{path}: the organ encloses label {n} ({ml[n]:.1f} ml), and nothing says what it "
+                f"is. Give --tumor {n}, --organ {n} as well if it is part of the organ, or "
+                "--tumor 0 if there is no tumor."
+            )
+        name = f" {parts.names[n]}" if n in parts.names else ""
+        notes.append(Finding("beside", {"label": n, "name": name, "ml": float(ml[n])}))
     return chosen, structures, [parts.note, *notes] if parts.note else notes, side
 
 
 def _cut(
     name: str, labels: LabelVolume, shape: tuple[int, ...], affine: np.ndarray
-) -> list[CaseWarning]:
+) -> list[Finding]:
     """A warning if the organ reaches the border of the image of this shape, which has the labels'
     grid."""
-    voxels, area_mm2 = 0, 0.0
-    start = _start(affine, labels)
-    for axis, (first, n) in enumerate(zip(start, shape, strict=True)):
-        face_mm2 = np.linalg.norm(np.cross(*np.delete(affine[:3, :3], axis, axis=1).T))
+    counts = np.zeros(3)
+    for axis, (first, n) in enumerate(zip(_start(affine, labels), shape, strict=True)):
         for index in (-first, n - 1 - first):
             if 0 <= index < labels.labels.shape[axis]:
-                count = int(np.count_nonzero(labels.labels.take(index, axis)))
-                voxels, area_mm2 = voxels + count, area_mm2 + count * float(face_mm2)
-    warning = CaseWarning("cut", part=name, voxels=voxels, area_cm2=area_mm2 / 100)
-    return [warning] if voxels > _FEW else []
+                counts[axis] += np.count_nonzero(labels.labels.take(index, axis))
+    voxels, area_cm2 = float(counts.sum()), float(counts @ face_areas_mm2(affine)) / 100
+    return _where(voxels > _FEW, "cut", part=name, voxels=voxels, area_cm2=area_cm2)
 
 
 def _check_every_slice(solid: np.ndarray, affine: np.ndarray, path: Path) -> None:
@@ -298,30 +282,26 @@ def _check_every_slice(solid: np.ndarray, affine: np.ndarray, path: Path) -> Non
             same = np.count_nonzero(slices[last] & slices[following])
             if same > _SAME_DRAWN * np.count_nonzero(slices[last]):
                 raise InputError(
-                    f"{path}: slices between drawn ones are empty (index {last + 1}, the first of "
-                    'them). Fill them (3D Slicer: Segment Editor, "Fill between slices").'
+                    f"{path}: from index {last + 1} on, slices between drawn ones are empty. Fill "
+                    'them (3D Slicer: Segment Editor, "Fill between slices").'
                 )
 
 
-def _flat(name: str, labels: LabelVolume) -> list[CaseWarning]:
+def _flat(name: str, labels: LabelVolume) -> list[Finding]:
     """A warning where the organ ends in a plane of the grid, with hardly less than its middle."""
-    solid, worst_mm2 = labels.labels > 0, 0.0
-    affine = labels.lps_from_index
-    for axis in range(3):
-        face_mm2 = float(np.linalg.norm(np.cross(*np.delete(affine[:3, :3], axis, axis=1).T)))
-        voxels = np.moveaxis(solid, axis, 0).sum((1, 2))
+    worst_mm2 = 0.0
+    for axis, face_mm2 in enumerate(face_areas_mm2(labels.lps_from_index).tolist()):
+        voxels = np.moveaxis(labels.labels > 0, axis, 0).sum((1, 2))
         end = voxels[np.flatnonzero(voxels)[[0, -1]]].max()
         if end > _FLAT * voxels.max():
             worst_mm2 = max(worst_mm2, face_mm2 * float(end))
-    warning = CaseWarning("flat", part=name, area_cm2=worst_mm2 / 100)
-    return [warning] if worst_mm2 else []
+    return _where(worst_mm2 > 0, "flat", part=name, area_cm2=worst_mm2 / 100)
 
 
-def _unusual(kind: Organ, measured: dict[str, Any]) -> list[CaseWarning]:
+def _unusual(kind: Organ, measured: dict[str, Any]) -> list[Finding]:
     low, high = _USUAL_ML.get(kind.name, (0.0, np.inf))
     ml = measured["volumes_ml"][kind.name]
-    warning = CaseWarning("size", part=kind.words, ml=ml, low=low, high=high)
-    return [] if low <= ml <= high else [warning]
+    return _where(not low <= ml <= high, "volume", part=kind.words, ml=ml, low=low, high=high)
 
 
 def patient_of(path: Path, in_file: Patient, identifier: str | None, side: Side) -> Patient:
@@ -329,8 +309,8 @@ def patient_of(path: Path, in_file: Patient, identifier: str | None, side: Side)
     ``side``. Raises InputError: the file at ``path`` states the other side."""
     if in_file.differs(Patient(side=side)):
         raise InputError(
-            f"{path} states the {in_file.side} side (DICOM Laterality), and the {side} one was "
-            "selected. Check --side, and that these are the right images."
+            f"{path} states the {in_file.side} side (DICOM), and the {side} one was selected. "
+            "Check --side, and that these are the right images."
         )
     return Patient(identifier or in_file.id, in_file.side if side == UNKNOWN else side)
 
@@ -371,14 +351,11 @@ def _with_ct(case: Case, path: Path) -> Case:
     if np.abs(steps - np.rint(steps)).max() > _OFF_GRID or not np.allclose(
         steps[:3, :3], np.eye(3), atol=_OFF_GRID / max(case.labels.labels.shape)
     ):
-        raise InputError(
-            f"--ct {path}: its voxels are not the labels'. Give the CT that they were drawn on, or "
-            "resample one of the two."
-        )
+        raise InputError(f"--ct {path}: its voxels are not the labels'. Resample one of the two.")
     if case.patient.differs(raw.patient):
         raise InputError(f"--ct {path} is of {raw.patient}, the labels of {case.patient}.")
     notes = case.report["notes"]
-    if not any(isinstance(note, CaseWarning) and note.kind == "cut" for note in notes):
+    if not any(isinstance(note, Finding) and note.kind == "cut" for note in notes):
         words = case.anatomy.kind.words
         notes = [*notes, *_cut(words, case.labels, volume.hu.shape, volume.lps_from_index)]
     return replace(case, ct=crop_ct(volume, case.labels), report={**case.report, "notes": notes})

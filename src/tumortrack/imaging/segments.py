@@ -58,9 +58,7 @@ def check_side(names: Iterable[str], side: Side) -> None:
     for name in names:
         said = {_SIDES[word] for word in words_of(name) if word in _SIDES}
         if side != UNKNOWN and said and side not in said:
-            raise InputError(
-                f"{name!r} is the {said.pop()} one by its name; --side says {side}. Correct one."
-            )
+            raise InputError(f"--side says {side}, and {name!r} another one. Correct one of them.")
 
 
 class Parts(NamedTuple):
@@ -92,8 +90,8 @@ def parts_of(raw: RawVolume, options: PrepareOptions, where: str) -> Parts:
     listing = ", ".join(f"{n} {name}" for n, name in names.items())
     if not organ:
         raise InputError(
-            f"{where} holds {listing}: none is a {options.kind.words} by name. Say which is: "
-            "--organ NUMBER, or --name of another organ."
+            f"{where} holds {listing}: none is a {options.kind.words} by name. Give --organ "
+            "NUMBER, or --name of another organ."
         )
     check_side((names[n] for n in organ if n in names), options.stated_side)
     if tumors is None:

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float, Int32, UInt8
 from scipy import ndimage
 
-from tumortrack.core.case_warning import CaseWarning
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm
 from tumortrack.core.organ import KIDNEY, Organ
 from tumortrack.core.patient import UNKNOWN, Side
+from tumortrack.core.report import Finding, Note
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume
 from tumortrack.imaging import grid
 from tumortrack.imaging.options import MIN_TUMOR_ML
@@ -69,24 +69,18 @@ def select_labels(
     tumors: tuple[int, ...] | None = None,
     min_tumor_ml: float = MIN_TUMOR_ML,
     kind: Organ = KIDNEY,
-) -> tuple[LabelVolume, list[str], Side]:
+) -> tuple[LabelVolume, list[Note], Side]:
     """Keep one organ (label 1) and its tumors (2, 3, ...), cropped with a margin.
 
     An organ is a large connected piece of organ and tumor voxels. A tumor within 3 mm of an organ
     belongs to it; one farther away is left out with a note; other pieces are dropped as specks.
-    A tumor is a piece of one tumor label inside that organ; those below ``min_tumor_ml`` become
-    organ. Tumor labels keep their order; pieces of one label are ordered by size. Raises
-    InputError: no organ, no such tumor label, two organs of a pair without tumor and no ``side``,
-    the only tumor lies apart from every organ.
+    A tumor is a piece of one label of ``tumors`` (None: all others from 2 up) inside that organ;
+    those below ``min_tumor_ml`` become organ. Tumor labels keep their order; pieces of one label
+    are ordered by size. Of a pair the patient's ``side`` is taken; unknown: with the most tumor.
 
-    Args:
-        side: the PATIENT's ``left`` or ``right``; unknown: the organ with the most tumor.
-        tumors: their labels; None takes every other label from 2 up.
-        kind: which organ it is; only paired organs are chosen by side.
-
-    Returns:
-        The selected labels, notes on what was dropped or renumbered, and the organ's side: measured
-        in a map with both organs of a pair, else as given.
+    Returns the labels, notes on what was dropped or renumbered, and the organ's side: measured in a
+    map with both organs of a pair, else as given. Raises InputError: no organ, no such tumor label,
+    two organs of a pair without tumor and no ``side``, the only tumor lies apart from every organ.
     """
     labels, affine = label_volume.labels, label_volume.lps_from_index
     present = [int(n) for n in np.flatnonzero(grid.label_counts(labels)) if n > 0]
@@ -105,7 +99,8 @@ def select_labels(
     notes += [note] if note else []
     for n in set(organs) - {chosen}:
         if not (kind.in_pairs and abs(pieces.x_mm(n) - pieces.x_mm(chosen)) > _PAIR_APART_MM):
-            notes.append(CaseWarning("dropped", what=kind.words, ml=float(pieces.whole_ml[n])))
+            ml = float(pieces.whole_ml[n])
+            notes.append(Finding("dropped", {"what": kind.words, "ml": ml}))
     if not _MIN_ML <= (ml := pieces.whole_ml[chosen]) <= _MAX_ML:
         raise InputError(
             f"label {organ} and its tumors fill {ml:.1f} ml; an organ has "
@@ -132,25 +127,18 @@ def _check_border(counted: np.ndarray) -> None:
     inner = counted[1:-1, 1:-1, 1:-1]
     share = (counted.sum() - inner.sum()) / max(counted.size - inner.size, 1)
     if share > _MOST_OF_BORDER:
-        raise InputError(
-            f"organ and tumors cover {share:.0%} of the label map's border, so their surface is "
-            "cut off. Give a map that holds the whole organ, with a margin about it."
-        )
+        raise InputError(f"{share:.0%} of the map's border is labelled. Give it a wider margin.")
 
 
 def _check_ruggedness(labels: np.ndarray, affine: np.ndarray) -> None:
     """Refuse noise, as meshing it would take minutes."""
-    i, j, k = affine[:3, :3].T
-    area_mm2 = sum(
-        np.count_nonzero(np.diff(labels, axis=axis)) * float(np.linalg.norm(np.cross(a, b)))
-        for axis, (a, b) in enumerate(((j, k), (k, i), (i, j)))
-    )
+    borders = [np.count_nonzero(np.diff(labels, axis=axis)) for axis in range(3)]
+    area_mm2 = borders @ grid.face_areas_mm2(affine)
     volume_mm3 = 1000 * np.count_nonzero(labels) * grid.voxel_ml(affine)
     if area_mm2 > _MOST_RUGGED * volume_mm3 ** (2 / 3):
         raise InputError(
-            f"the labels are torn to shreds: {volume_mm3 / 1000:.0f} ml with borders of "
-            f"{area_mm2 / 100:.0f} cm2, where an organ and its tumors have a tenth. This is noise "
-            "rather than a segmentation; smooth it, or draw it anew."
+            f"the labels are noise: {volume_mm3 / 1000:.0f} ml with borders of "
+            f"{area_mm2 / 100:.0f} cm2, where an organ has a tenth. Smooth them."
         )
 
 
@@ -185,21 +173,15 @@ def _large_pieces(pieces: _Pieces) -> list[int]:
 
 def _attach_tumors(
     pieces: _Pieces, organs: list[int], min_tumor_ml: float
-) -> tuple[_Pieces, list[str], list[int]]:
+) -> tuple[_Pieces, list[Note], list[int]]:
     """Join each piece with a tumor of at least ``min_tumor_ml`` to an organ within 3 mm (or one
-    voxel where voxels are larger), so that they have one surface. The gap is filled with organ
-    where the two face each other.
-
+    voxel where voxels are larger): the gap is filled with organ where the two face each other.
     Returns the pieces, joined ones numbered as their organ; notes; numbers of pieces farther away.
     """
-    notes: list[str] = []
-    apart: list[int] = []
+    notes, apart = list[Note](), list[int]()
     separate = [n for n in _with_tumor(pieces, min_tumor_ml) if n not in organs]
     if len(separate) > _MOST_TUMORS:
-        raise InputError(
-            f"{len(separate)} tumors lie beside the organ, more than {_MOST_TUMORS}; raise "
-            "--min-tumor-ml or check the labels."
-        )
+        raise InputError(f"over {_MOST_TUMORS} tumors lie beside the organ: raise --min-tumor-ml.")
     for number in separate:
         ml = float(pieces.tumor_ml[number])
         joined = _joined(pieces, organs, number)
@@ -250,27 +232,25 @@ def _joined(pieces: _Pieces, organs: list[int], number: int) -> tuple[_Pieces, f
 
 def _left_out(
     pieces: _Pieces, organs: list[int], apart: list[int], min_tumor_ml: float
-) -> list[str]:
+) -> list[Note]:
     """Notes on specks and on tumors apart from every organ. Raises InputError: there is no
     other."""
-    notes: list[str] = []
     specks_ml = np.delete(pieces.whole_ml, [0, *apart, *organs])
     large_ml, specks_ml = specks_ml[specks_ml >= _SPECK_ML], specks_ml[specks_ml < _SPECK_ML]
-    notes += [CaseWarning("dropped", what="label map", ml=ml) for ml in large_ml.tolist()]
+    what = "label map"
+    notes: list[Note] = [Finding("dropped", {"what": what, "ml": ml}) for ml in large_ml.tolist()]
     if count := int((specks_ml > 0).sum()):
         notes.append(f"{count} specks beside the organ dropped ({specks_ml.sum():.2f} ml together)")
-    if not apart:
-        return notes
-    text = " and ".join(f"{pieces.tumor_ml[n]:.1f} ml" for n in apart[:5])
-    if not set(organs) & set(_with_tumor(pieces, min_tumor_ml)):
+    if apart and not set(organs) & set(_with_tumor(pieces, min_tumor_ml)):
+        text = " and ".join(f"{pieces.tumor_ml[n]:.1f} ml" for n in apart[:5])
         raise InputError(
             f"the only tumor ({text}) lies more than {_GAP_MM:g} mm from the organ. Check the "
             "labels and --organ, or give --tumor 0 to leave it out."
         )
-    for n in apart:
-        ml = float(pieces.tumor_ml[n])
-        notes.append(CaseWarning("left_out", what="tumor", ml=ml, mm=_GAP_MM))
-    return notes
+    return notes + [
+        Finding("left_out", {"what": "tumor", "ml": ml, "mm": _GAP_MM})
+        for ml in pieces.tumor_ml[apart].tolist()
+    ]
 
 
 def _choose(
@@ -293,10 +273,8 @@ def _choose(
         middle_x_mm = (right_mm + left_mm) / 2
     if side == UNKNOWN:
         if pieces.tumor_ml[best] == 0:
-            raise InputError(
-                f"the label map holds {len(organs)} {kind.words}s and no tumor. Give --side left "
-                "or --side right (the patient's)."
-            )
+            what = f"{len(organs)} {kind.words}s and no tumor"
+            raise InputError(f"the label map holds {what}. Give --side left or --side right.")
         side = "left" if x_mm[best] > middle_x_mm else "right"
         note = f"the patient's {side} {kind.words} was chosen: it bears most tumor"
         return best, note, side if left_mm - right_mm > _PAIR_APART_MM else UNKNOWN
@@ -305,10 +283,7 @@ def _choose(
     slack = _MIDLINE_MARGIN_MM if alone else 0.0
     fitting = [n for n in organs if sign * (x_mm[n] - middle_x_mm) > -slack]
     if not fitting:
-        raise InputError(
-            f"no {kind.words} on the patient's {side} side in this label map; its {kind.words} "
-            "lies on the other side. Leave out --side, or check the map's orientation."
-        )
+        raise InputError(f"the {kind.words} lies on the patient's other side. Check --side.")
     note = f"only one {kind.words} in the map; its side was checked against the image's middle only"
     return max(fitting, key=tumor_then_size), note if alone else "", side
 

@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm, transform_points
+from tumortrack.core.report import Note
 from tumortrack.core.types import Anatomy, LabelVolume, Mesh
 from tumortrack.imaging.grid import bounding_box
 from tumortrack.imaging.meshes import read_lps
@@ -59,9 +60,9 @@ def split_structures(
 
 def read_structures(
     sources: StructureSources, unit: str | None
-) -> tuple[dict[str, Mesh], list[str]]:
+) -> tuple[dict[str, Mesh], list[Note]]:
     """The structures in mesh files, LPS mm, and notes. Raises InputError: no mesh, or too large."""
-    meshes, notes = {}, list[str]()
+    meshes, notes = {}, list[Note]()
     for name, path in sources.items():
         if isinstance(path, Path):
             meshes[name] = read_lps(path, 1000.0 if unit == "m" else 1.0, notes)

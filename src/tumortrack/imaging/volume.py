@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
 
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, readable
 from tumortrack.core.tables import read_table
 from tumortrack.core.types import LabelVolume, Volume
 from tumortrack.imaging import grid
@@ -23,7 +24,6 @@ from tumortrack.imaging.dicom_segmentation import read_segmentation
 from tumortrack.imaging.nifti import read_nifti
 from tumortrack.imaging.segments import Parts, painted
 
-_DETACHED = (".nhdr", ".hdr", ".img")
 _VOLUMES = (".nii", ".nii.gz", ".nrrd")
 MOST_LABELS = 32  # distinct values that still look like a label map
 _SAME_MM = 0.01  # of the grids of several files
@@ -47,25 +47,18 @@ def read_raw(path: Path, series: str | None = None) -> grid.RawVolume:
     name = path.name.lower()
     if path.is_dir():
         return read_dicom(path, series)
-    if not path.is_file():
-        raise InputError(f"{path} does not exist or is no file (but a pipe or a device).")
-    if path.stat().st_size == 0:
-        raise InputError(f"{path} is empty (0 bytes).")
+    if not path.is_file() or path.stat().st_size == 0:
+        raise InputError(f"{path} does not exist, is empty, or is a pipe or a device.")
     if name.endswith((".dcm", ".ima")) or is_dicom(path):
         return read_segmentation(path) or read_dicom(path, series)
     if name.endswith((".nii", ".nii.gz")):
         return read_nifti(path)
     if name.endswith(".nrrd"):
         return _read_nrrd(path)
-    if name.endswith(_DETACHED):
-        raise InputError(
-            f"{path} is a header whose voxels lie in another file; detached data are refused. "
-            "Export one .nrrd, .nii or .nii.gz file."
-        )
+    if name.endswith((".nhdr", ".hdr", ".img")):
+        raise InputError(f"{path}: its voxels lie in another file. Export one .nrrd or .nii.gz.")
     grid.check_suffix(path)
-    raise InputError(
-        f"{path} is no volume. Allowed: a folder of DICOM slices, .dcm, .nii, .nii.gz, .nrrd."
-    )
+    raise InputError(f"{path} is no volume. Allowed: DICOM slices, .nii, .nii.gz, .nrrd.")
 
 
 def is_dicom(path: Path) -> bool:
@@ -97,32 +90,27 @@ def volume_of(raw: grid.RawVolume, path: Path) -> Volume:
     """Raw voxels as a CT. Raises InputError, which names ``path``: not plausibly HU."""
     hu = raw.array.astype(np.float32, copy=False)
     low, high = float(hu.min()), float(hu.max())
-    if not (np.isfinite(low) and np.isfinite(high)):
-        raise InputError(f"{path} has NaN or infinite voxels. Export it again without them.")
-    if max(-low, high) > 100_000:
+    if not max(-low, high) <= 100_000:  # nor NaN
         raise InputError(
-            f"{path} has values from {low:g} to {high:g}; Hounsfield units are needed."
+            f"{path} has values from {low:g} to {high:g}, which are no Hounsfield units."
         )
     return Volume(hu, raw.lps_from_index)
 
 
 def labels_of(raw: grid.RawVolume, path: Path) -> LabelVolume:
     """Raw voxels as labels. Raises InputError: not whole numbers in 0..255, of any type."""
-    low, high = float(raw.array.min()), float(raw.array.max())
-    if not (low >= -_OFF_WHOLE and high <= 255 + _OFF_WHOLE):
-        raise InputError(
-            f"{path} is no label map: values from {low:g} to {high:g}; whole numbers from 0 to "
-            "255 are allowed."
-        )
-    labels = _whole(raw.array)
-    if labels is None:
-        raise InputError(f"{path} is no label map: it has fractions. Whole numbers are needed.")
+    if (labels := _whole(raw.array)) is None:
+        low, high = raw.array.min(), raw.array.max()
+        fault = f"values from {low:g} to {high:g}, or fractions"
+        raise InputError(f"{path} is no label map ({fault}): whole numbers of 0..255 are needed.")
     return LabelVolume(labels, raw.lps_from_index)
 
 
 def _whole(array: np.ndarray) -> UInt8[np.ndarray, "i j k"] | None:
-    """Numbers from 0 to 255 as whole ones, to which they must be as close as rounding leaves them;
-    None: they are not."""
+    """Numbers as labels, to which they must be as close as rounding leaves them; None: they are
+    not."""
+    if not (array.min() >= -_OFF_WHOLE and array.max() <= 255 + _OFF_WHOLE):
+        return None
     if array.dtype.kind != "f":
         return array.astype(np.uint8)
     labels = np.rint(array).astype(np.uint8)
@@ -139,15 +127,26 @@ def label_map(raw: grid.RawVolume, parts: Parts, path: Path) -> LabelVolume:
         if lost and not parts.stated:
             n, name = lost[0], parts.names[lost[0]]
             raise InputError(
-                f"{path}: {n} {name} lies in the organ, and its name does not say what it is. Give "
-                f"--tumor {n} with the other tumors, --organ {n} as well if it is part of the "
-                "organ, or --tumor 0."
+                f"{path}: {n} {name} lies in the organ. Give --tumor {n} with the other tumors, "
+                f"--organ {n} as well if it is part of the organ, or --tumor 0."
             )
         return LabelVolume(labels, raw.lps_from_index)
     volume, (first, *others) = labels_of(raw, path), parts.organ
     same = np.arange(256, dtype=np.uint8)
     same[others] = first
     return LabelVolume(same[volume.labels], volume.lps_from_index) if others else volume
+
+
+def read_files(paths: list[Path], files: list[Path], series: str | None) -> grid.RawVolume:
+    """One volume, or several label files, of ``paths`` that hold the ``files``. Raises InputError:
+    see ``read_raw`` and ``read_several``."""
+    if len(paths) > 1:
+        return read_several(files)
+    volumes, others = [f for f in files if is_volume(f)], [f for f in files if not is_volume(f)]
+    if not (paths[0].is_dir() and volumes) or any(map(is_dicom, others)):
+        return read_raw(paths[0], series)
+    raw, names = read_several(volumes), ", ".join(file.name for file in others[:5])
+    return replace(raw, notes=(f"no label files, left out: {names}",)) if others else raw
 
 
 def read_several(files: Sequence[Path]) -> grid.RawVolume:
@@ -162,14 +161,9 @@ def read_several(files: Sequence[Path]) -> grid.RawVolume:
         labels, affine = volume.labels, volume.lps_from_index
         same = labels.shape == first.array.shape
         if not same or not np.allclose(affine, first.lps_from_index, atol=_SAME_MM):
-            raise InputError(
-                f"{file} has another grid than {files[0]}. Export all segments on the same one."
-            )
+            raise InputError(f"{file} has another grid than {files[0]}. Export both on the same.")
         if len(found := np.unique(labels)) > 2 or found[0] != 0:
-            raise InputError(
-                f"{file} has labels {found[:9].tolist()}: of several files each holds one structure"
-                " and 0 around it. Give a label map alone."
-            )
+            raise InputError(f"{file} has labels {found[:9].tolist()}. Give a label map alone.")
         return labels > 0
 
     names = [stem(file) for file in files]
@@ -183,8 +177,6 @@ def read_several(files: Sequence[Path]) -> grid.RawVolume:
 def is_label_map(raw: grid.RawVolume, most: int = MOST_LABELS) -> bool:
     """Whether there are only whole numbers in 0..255, at most so many different ones: few CTs have
     256, none 32."""
-    if not (raw.array.min() >= -_OFF_WHOLE and raw.array.max() <= 255 + _OFF_WHOLE):
-        return False
     labels = _whole(raw.array)
     return labels is not None and int((grid.label_counts(labels) > 0).sum()) <= most
 
@@ -193,30 +185,24 @@ def _read_nrrd(path: Path) -> grid.RawVolume:
     """Read an attached .nrrd (raw or gzip) with a stated patient space."""
     fields, start = _header(path)
     encoding = fields.get("encoding", "raw").lower()
-    if encoding not in _IS_GZIP:
+    if (compressed := _IS_GZIP.get(encoding)) is None:
         raise InputError(f"{path}: encoding {encoding!r} is not read. Export as raw or gzip.")
-    try:
+    with readable(path, "has a NRRD header that is damaged or lacks a field"):
         layers, shape = 1, tuple(int(n) for n in fields["sizes"].split())
         if len(shape) == 4 and "segment0_id" in fields:  # the first axis holds layers
             layers, shape = shape[0], shape[1:]
         dtype = np.dtype(_TYPES[fields["type"].lower()])
         lps_from_index = _lps_from_index(path, fields) if len(shape) == 3 else np.eye(4)
-    except (KeyError, ValueError, OverflowError) as error:
-        raise InputError(
-            f"{path}: the NRRD header is damaged or lacks a field ({error}). Export it again."
-        ) from error
-    grid.check_size(path, shape, layers * dtype.itemsize, _IS_GZIP[encoding])
+    grid.check_size(path, shape, layers * dtype.itemsize, compressed)
     grid.check_affine(path, lps_from_index)
-    whole = (layers, *shape)
     if fields.get("dimension") != str(len(fields["sizes"].split())):
         raise InputError(f"{path}: dimension {fields.get('dimension')} is not that of its sizes.")
     if dtype.itemsize > 1:
         if fields.get("endian", "").lower() not in ("little", "big"):
             raise InputError(f"{path}: the NRRD header states no byte order. Export it again.")
         dtype = dtype.newbyteorder("<" if fields["endian"].lower() == "little" else ">")
-    compressed = _IS_GZIP[encoding]
     with grid.volume_stream(path, compressed, start) as stream:
-        array = grid.read_voxels(path, stream, whole, dtype, compressed)
+        array = grid.read_voxels(path, stream, (layers, *shape), dtype, compressed)
     segments = _segments(path, fields, array)
     array = painted(shape, segments)[0] if layers > 1 else array[0]
     return grid.RawVolume(array, lps_from_index, segments=segments)
@@ -232,27 +218,17 @@ def _segments(path: Path, fields: dict[str, str], layers: np.ndarray) -> tuple[g
             fields.get(f"segment{n}_{key}", default)
             for key, default in (("labelvalue", "1"), ("layer", str(n)), ("name", ""))
         )
-        try:
+        with readable(path, f"has no label {value!r} of layer {layer!r}, its segment {n}"):
             place = int(layer) if len(layers) > 1 else 0, int(value)
             layers[place[0]]
-        except (ValueError, IndexError) as error:
-            raise InputError(
-                f"{path}: its segment {n} is label {value!r} of layer {layer!r}, which the file "
-                "does not have. Export it again."
-            ) from error
         if place in found:
-            raise InputError(
-                f"{path}: its segments {found[place]!r} and {name!r} are both label {value} of one "
-                "layer. Export it again."
-            )
+            both = f"{found[place]!r} and {name!r} are both label {value} of one layer"
+            raise InputError(f"{path}: its segments {both}. Export it again.")
         found[place] = name or fields[f"segment{n}_id"]
     for at, array in enumerate(layers if found else ()):
         known = [0, *(number for own_layer, number in found if own_layer == at)]
         if others := np.setdiff1d(array, known).tolist():
-            raise InputError(
-                f"{path}: none of its segments is label {others[0]:g}, which its voxels have. "
-                "Export it again with all segments."
-            )
+            raise InputError(f"{path} has voxels of label {others[0]:g}, which no segment has.")
     values = [value for _, value in found]
     if len(found) > 255:
         raise InputError(f"{path} has {len(found)} segments; at most 255 are read.")
@@ -291,8 +267,8 @@ def _lps_from_index(path: Path, fields: dict[str, str]) -> np.ndarray:
     sign = _LPS_FROM_SPACE.get(fields.get("space", "").lower())
     if sign is None or "space directions" not in fields:
         raise InputError(
-            f"{path} states no patient orientation (space {fields.get('space')!r}), so left and "
-            "right are unknown. Export it with space left-posterior-superior or RAS."
+            f"{path} states no patient orientation (space {fields.get('space')!r}). Export it with "
+            "space left-posterior-superior or RAS."
         )
     units = fields.get("space units", "").replace('"', " ").split()
     if any(unit.lower() not in ("mm", "millimeter", "millimetre") for unit in units):

@@ -73,10 +73,7 @@ def read_frames(path: Path, moves: bool = False) -> PublishedFrame:
         if "_from_" in name and (rows := getattr(file, name)) is not None
     }
     if moves != (_TOOL in matrices):
-        raise InputError(
-            f"{path}: {_TOOL} is of a camera that a robot moves; it goes with `track --moving` "
-            "alone, and nothing else does."
-        )
+        raise InputError(f"{path}: {_TOOL} is of a camera that moves, and `track --moving` of it.")
     match list(matrices.items()):
         case [("robot_from_camera" | "tool_from_camera", robot_from_camera)]:
             pass
@@ -87,22 +84,20 @@ def read_frames(path: Path, moves: bool = False) -> PublishedFrame:
         case _:
             raise InputError(
                 f"{path} must have camera_from_robot, or robot_from_camera, or camera_from_marker "
-                f"and robot_from_marker; it has {', '.join(matrices) or 'none of them'}."
+                f"and robot_from_marker; it has {', '.join(matrices) or 'none'}."
             )
     if not file.frame_id.strip():
         raise InputError(f"{path}: frame_id is empty; give the robot's frame, base_link say.")
     table, camera = file.table_in_camera, file.camera_frame_id.strip().removeprefix("/")
     if table is not None:
-        if not abs(np.linalg.norm(table[:3]) - 1) < _NOT_UNIT or not np.isfinite(table[3]):
+        length = float(np.linalg.norm(table[:3]))
+        if moves or not abs(length - 1) < _NOT_UNIT or not np.isfinite(table[3]):
             raise InputError(
                 f"{path}: table_in_camera must be a unit normal (3 numbers) and the plane's offset "
-                f"in {file.unit}, camera frame, as a run's report says it."
+                f"in {file.unit}, in the frame of a camera that stands still."
             )
-        length = float(np.linalg.norm(table[:3]))  # 1 but for the file's few digits
         x, y, z, offset = (number / length for number in table)
         table = x, y, z, offset * (1000 if file.unit == "m" else 1)
-    if moves and table is not None:
-        raise InputError(f"{path}: table_in_camera is of a camera that stands still.")
     error = file.error_mm, file.error_deg
     return PublishedFrame(file.frame_id, robot_from_camera, True, camera, table, *error, moves)
 
@@ -120,9 +115,7 @@ def _easy_handeye(path: Path) -> dict[str, Any]:
     needed = *_PLACE, *_TURN, "robot_base_frame", "tracking_base_frame"
     if on_hand is None or (missing := [name for name in needed if name not in found]):
         lack = "eye_on_hand" if on_hand is None else ", ".join(missing)
-        raise InputError(
-            f"{path} lacks {lack}, which easy_handeye writes. Allowed: such a file, or JSON."
-        )
+        raise InputError(f"{path} lacks {lack}, which easy_handeye writes. Allowed: also JSON.")
     metres, turn = (
         [number_in(found[name], f"{path}: {name}") for name in names] for names in (_PLACE, _TURN)
     )

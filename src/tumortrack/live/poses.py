@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from abc import abstractmethod
 from bisect import bisect_left
-from collections.abc import Callable
 from pathlib import Path
 from typing import ClassVar
 
@@ -13,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from tumortrack.core.config import Config
-from tumortrack.core.csv_tables import number_in, read_rows, whole_in
+from tumortrack.core.csv_tables import read_rows, whole_in
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import HERE, Affine, rigid
 from tumortrack.core.report import Finding
@@ -122,24 +121,12 @@ class FilePoses(CameraPoses):
     InputError: there is no such table, or it is damaged."""
 
     def __init__(self, path: Path) -> None:
-        table = read_rows(read_file(path, _LARGEST_TABLE), str(path))
-        names, at = COLUMNS.split(","), table.columns
-        names += [CONTACT[1:]] * (CONTACT[1:] in at)
-        if set(names) != at.keys():
-            raise InputError(
-                f"{path} is not a table of poses: its columns are {','.join(table.header)[:120]}; "
-                f"they must be {COLUMNS}, and {CONTACT[1:]} of a tool."
-            )
-
-        def column(name: str, read: Callable[[str, str], float]) -> list[float]:
-            return [
-                read(row[at[name]], f"{path}, line {n}, column {name}") for n, row in table.rows
-            ]
-
-        stamps_ns = np.array(column(names[0], whole_in), np.int64)
-        numbers = np.stack([column(name, number_in) for name in names[2:]], axis=1)
-        frames = {row[at["frame_id"]] for _, row in table.rows}
-        numbers, touches = np.hsplit(numbers, [7])
+        names, contact = COLUMNS.split(","), CONTACT[1:]
+        table = read_rows(read_file(path, _LARGEST_TABLE), str(path), names, [contact])
+        stamps_ns = np.array(table.column("stamp_ns", whole_in), np.int64)
+        frames = set(table.column("frame_id", lambda text, _: text))
+        numbers = table.numbers(names[2:])
+        touches = table.numbers([contact] if contact in table.columns else [])
         lengths = np.linalg.norm(numbers[:, 3:], axis=1)
         faults = {
             "contact must be 0 or 1": np.isin(touches, (0, 1)).all(),

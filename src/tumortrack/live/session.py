@@ -204,7 +204,7 @@ def session(
         {
             "patient": to_builtins(tracker.model.patient),
             "model": tracker.model.provenance,
-            "notes": list(tracker.model.warnings),
+            "notes": [weakness.words for weakness in tracker.model.warnings],
             **digest,
             "source": next(iter(setup.sources)),
             "sinks": list(named),

@@ -6,10 +6,10 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from tumortrack.core.case_warning import CaseWarning, warnings_in
-from tumortrack.core.config import Config
+from tumortrack.core.config import Config, findings_in
 from tumortrack.core.organ import Organ, organ_in
 from tumortrack.core.patient import Patient, patient_in
+from tumortrack.core.report import Finding
 from tumortrack.models.in_distribution import InDistributionRange
 
 if TYPE_CHECKING:
@@ -47,9 +47,9 @@ class Model(ABC):
         return organ_in(self.provenance.get("organ"), "provenance")
 
     @property
-    def warnings(self) -> tuple[CaseWarning, ...]:
+    def warnings(self) -> tuple[Finding, ...]:
         """What weakens the case that it is made of."""
-        return warnings_in(self.provenance.get("warnings"), "provenance")
+        return findings_in(self.provenance.get("warnings"), "provenance")
 
     @abstractmethod
     def files(self) -> dict[str, bytes]:

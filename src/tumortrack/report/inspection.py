@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tumortrack.core import store
-from tumortrack.core.case_warning import warnings_in
+from tumortrack.core.config import findings_in
 from tumortrack.core.errors import InputError
 from tumortrack.core.tables import read_table
 
@@ -92,7 +92,9 @@ def _with_figures(content: Content, folder: Path) -> Content:
     figures: dict[str, Any] = {}
     if "up_lps" in content or "familiar" in content:
         about = content.get("provenance", content)
-        figures["weak"] = list(warnings_in(about.get("warnings"), str(folder)))
+        figures["weak"] = [
+            weakness.words for weakness in findings_in(about.get("warnings"), str(folder))
+        ]
     if "up_lps" in content:  # a case
         figures["lies"] = _poses(content["rotations"], content["tilt_degrees"])
         figures |= _of_the_cases_model(folder)

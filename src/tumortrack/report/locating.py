@@ -85,7 +85,10 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
     model = load_model(folder, options.device)
     tracker = Tracker(model, options.advise)
     about: dict[str, Any] = {
-        "notes": [*model.warnings, *_notes(views, points, tracker.anatomy_ct, options)],
+        "notes": [
+            *(weakness.words for weakness in model.warnings),
+            *_notes(views, points, tracker.anatomy_ct, options),
+        ],
         "input": [],
         "model": model.provenance,
         "model_sha256": store.sha256_of(folder / store.MANIFEST),

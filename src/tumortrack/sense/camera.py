@@ -46,10 +46,11 @@ def plausible(camera: Intrinsics, where: str) -> Intrinsics:
             f"{camera.width} x {camera.height}; 0.1 to 5 times the longer side are allowed (fields "
             "of view of 11 to 157 degrees). Give those of the image's own size, in pixels."
         )
-    if not all(-side < middle < 2 * side for middle in (camera.cx, camera.cy)):
+    middles = camera.cx, camera.cy  # 0 is what programs write that do not know it
+    if not all(-side < middle < 2 * side and middle for middle in middles):
         raise InputError(
-            f"{where}: the optical axis at {camera.cx:g}, {camera.cy:g} px lies far off an image "
-            f"of {camera.width} x {camera.height}. Give it in pixels of this image."
+            f"{where}: the optical axis is at {camera.cx:g}, {camera.cy:g} px of an image of "
+            f"{camera.width} x {camera.height}. Give it in pixels of this image."
         )
     return camera
 

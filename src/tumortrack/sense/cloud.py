@@ -83,9 +83,8 @@ def seen_points(
     missing, far = len(points_mm) - int(returned.sum()), int((returned & ~near).sum())
     if far > _MOST_FAR * returned.sum():
         raise InputError(
-            f"{name}: {far} of {len(points_mm)} points lie more than 20 m away, beyond any depth "
-            "camera: its numbers look like millimetres read as metres (then leave out --unit m), "
-            "or they are damaged. Give the camera frame, in mm."
+            f"{name}: {far} of {len(points_mm)} points lie more than 20 m away: it looks like "
+            "millimetres read as metres (leave out --unit m), or damaged."
         )
     dropped = {"without return (NaN or 0, 0, 0)": missing, "more than 20 m away": far}
     kept = points_mm if not missing + far else points_mm[returned & near]
@@ -97,13 +96,9 @@ def seen_points(
 
 
 def check_cloud(cloud: SensorCloud, fewest: int = FEWEST_POINTS) -> None:
-    """Refuse a cloud that cannot show an organ in front of the camera, in mm.
-
-    Raises:
-        InputError: the unit is evidently not mm (metres, or mm read as metres), or a point lies
-            more than 20 m away.
-        NoEstimate: fewer than so many distinct points, all on one line, or none before the camera.
-    """
+    """Refuse a cloud that cannot show an organ in front of the camera, in mm. Raises InputError:
+    the unit is evidently not mm, or a point lies more than 20 m away; NoEstimate: fewer than so
+    many distinct points, all on one line, or none before the camera."""
     points_mm = cloud.points_mm
     ordered = np.sort(points_mm.T, axis=1)
     distinct = 1 + int(np.count_nonzero(np.diff(ordered[0])))  # cheap, and mostly enough
@@ -120,18 +115,13 @@ def check_cloud(cloud: SensorCloud, fewest: int = FEWEST_POINTS) -> None:
         unit = Unit.METRE if extent_mm < _LONGEST_M else Unit.INCH
         raise InputError(
             f"the cloud is {extent_mm:.3g} wide and {middle[2]:.3g} away, which in mm is no organ: "
-            f"{unit.of_cloud} (millimetres are expected)."
-        )
-    if abs(middle[2]) > _FARTHEST_MM:
-        raise InputError(
-            f"the cloud is {middle[2]:.4g} mm away, beyond any depth camera: "
-            f"{Unit.MICROMETRE.of_cloud}."
+            f"{unit.of_cloud}."
         )
     farthest_mm = float(np.abs(ordered[:, [0, -1]]).max())
     if farthest_mm > _FARTHEST_MM:
-        raise InputError(
-            f"a point is {farthest_mm:.4g} mm away, beyond any depth camera. Remove such points."
-        )
+        all_far = abs(middle[2]) > _FARTHEST_MM
+        fault = Unit.MICROMETRE.of_cloud if all_far else "remove such points"
+        raise InputError(f"points are up to {farthest_mm:.4g} mm away: {fault}.")
     some = points_mm[:: max(1, len(points_mm) // 2000)]
     inner = some[((some >= low) & (some <= high)).all(axis=1)].astype(float)
     _, second, first = np.linalg.eigvalsh(np.cov(inner.T))
@@ -173,14 +163,11 @@ def check_depth_unit(frame: DepthFrame, unit_mm: float, near_mm: float, far_mm: 
 
 
 def _check_range(near_mm: float, far_mm: float) -> None:
+    given = f"the depth range {near_mm:g}..{far_mm:g} mm"
     if not 0 <= near_mm < far_mm < np.inf:
-        raise InputError(
-            f"the depth range {near_mm:g}..{far_mm:g} mm is empty; allowed: 0 <= near < far."
-        )
+        raise InputError(f"{given} is empty; allowed: 0 <= near < far.")
     if far_mm < _LEAST_FAR_MM:
-        raise InputError(
-            f"the depth range {near_mm:g}..{far_mm:g} mm looks like metres; give it in mm."
-        )
+        raise InputError(f"{given} looks like metres; give it in mm.")
 
 
 def _finite_depths(content: DepthFrame | SensorCloud) -> Float32[np.ndarray, " n"]:

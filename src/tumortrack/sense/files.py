@@ -10,7 +10,7 @@ import io
 import math
 import struct
 import zipfile
-from functools import partial
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from tumortrack.core.config import Config, from_builtins
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, readable
 from tumortrack.core.geometry import Affine, read_rigid
 from tumortrack.core.packages import to_install
 from tumortrack.core.store import read_file, read_json
@@ -28,7 +28,7 @@ from tumortrack.sense.cloud import seen_points
 from tumortrack.sense.ply import parse_ply_properties
 from tumortrack.sense.units import depths_mm
 
-CLOUD_SUFFIXES = (".ply", ".pcd", ".npz", ".npy")
+_CLOUD_SHAPES = "n x 3, n x 6 or (of floats) h x w x 3"
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy")  # an array may be either
 DEPTH_UNIT_MM = 0.1  # the D405's default
 LARGEST_FILE = 256 * 2**20  # bytes, also of what a compressed file unpacks to
@@ -70,29 +70,23 @@ def read_poses(path: Path, count: int) -> tuple[str, tuple[Affine, ...]]:
     """``frame_id`` and ``fixed_from_camera`` (mm) of ``count`` views from JSON (``PosesFile``).
     Raises InputError: missing file, unknown key, wrong number of views, no rigid transform."""
     file = from_builtins(read_json(path), PosesFile, str(path))
-    if len(file.fixed_from_camera) != count:
-        raise InputError(
-            f"{path} has {len(file.fixed_from_camera)} poses for {count} views; it must have one "
-            "for each, in their order."
-        )
-    poses = [
+    if (poses := len(file.fixed_from_camera)) != count:
+        raise InputError(f"{path} has {poses} poses for {count} views; it must have one for each.")
+    return file.frame_id, tuple(
         read_rigid(rows, file.unit, f"{path}: fixed_from_camera, view {n}")
         for n, rows in enumerate(file.fixed_from_camera, start=1)
-    ]
-    return file.frame_id, tuple(poses)
+    )
 
 
 def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud, tuple[str, ...]]:
     """A cloud in the camera frame from .ply, .pcd (all three encodings), .npz or .npy, without what
     ``cloud.seen_points`` drops, and its notes. Whether it can be an organ in mm is left to
-    ``cloud.check_cloud``.
-
-    Raises InputError: missing, too large, damaged, of another kind, or without any point.
-    """
+    ``cloud.check_cloud``. Raises InputError: missing, too large, damaged, of another kind, or
+    without any point."""
     suffix = path.suffix.lower()
     if path.is_dir():
         raise InputError(f"{path} is a folder. Give a cloud in it, such as {path / 'cloud.ply'}.")
-    if suffix not in CLOUD_SUFFIXES:
+    if suffix not in _CLOUDS:
         raise InputError(
             f"{path} is of no kind that is read. Allowed: clouds as {', '.join(CLOUD_SUFFIXES)}, "
             f"depth images as {', '.join(DEPTH_SUFFIXES)}: save an .exr as a TIFF of floats, a "
@@ -100,42 +94,31 @@ def read_cloud(path: Path, unit: Literal["mm", "m"] = "mm") -> tuple[SensorCloud
         )
     if unit not in ("mm", "m"):
         raise InputError(f"unit {unit!r} is not understood. Allowed: mm, m.")
-    parse: Any = {
-        ".ply": parse_ply_properties,
-        ".pcd": _pcd_points,
-        ".npz": partial(_npz_points, unit),
-        ".npy": _npy_points,
-    }[suffix]
-    raw = parse(read_file(path, LARGEST_FILE, "Thin it first."), str(path))
+    raw = _CLOUDS[suffix](read_file(path, LARGEST_FILE, "Thin it first."), str(path), unit)
+    columns, mm_per_unit = raw.shape[-1], 1000.0 if unit == "m" else 1.0
     # Beyond float32 becomes infinite, and is dropped like NaN, signalling or not.
     with np.errstate(over="ignore", invalid="ignore"):
-        points_mm = (raw * (1000.0 if unit == "m" else 1.0)).astype(np.float32)
+        points_mm = (raw[..., :3].reshape(-1, 3) * mm_per_unit).astype(np.float32)
     kept, notes = seen_points(points_mm, str(path))
     if len(kept) == 0:
         raise InputError(f"{path} holds no point with a return ({len(points_mm)} without).")
-    return SensorCloud(kept), notes
+    taken = f"took the first 3 of {columns} columns as x, y and z"
+    return SensorCloud(kept), (taken, *notes) if columns > 3 else notes
 
 
-def _pcd_points(content: bytes, name: str) -> np.ndarray:
-    """x, y, z as floats (n, 3), in the file's unit."""
+def _pcd_points(content: bytes, name: str, unit: str) -> np.ndarray:
     try:
         from pypcd4 import PointCloud
     except ImportError as error:
         raise InputError(f"a .pcd cloud needs pypcd4: {to_install('tumortrack[pcd]')}.") from error
 
     _check_pcd_size(content, name)
-    try:
+    with readable(name, "cannot be read as PCD with x, y and z"):
         cloud = PointCloud.from_fileobj(io.BufferedReader(io.BytesIO(content)))
         table = np.atleast_1d(cloud.pc_data)
         points = np.stack([table[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    except Exception as error:  # pypcd4 raises anything on a damaged file
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{name} cannot be read as PCD with x, y and z: {reason}.") from error
-    if len(points) != cloud.metadata.points:
-        raise InputError(
-            f"{name} claims {cloud.metadata.points} points but holds {len(points)}; it is "
-            "damaged. Export it again."
-        )
+    if len(points) != (claimed := cloud.metadata.points):
+        raise InputError(f"{name} claims {claimed} points but holds {len(points)}: it is damaged.")
     return points
 
 
@@ -154,8 +137,7 @@ def _check_pcd_size(content: bytes, name: str) -> None:
         raise InputError(f"{name} is no PCD file (its header lacks or garbles a line).") from error
     if any((x, y, z, *turn)) or len(turn) != 3:
         raise InputError(
-            f"{name} states a VIEWPOINT other than 0 0 0 1 0 0 0, so the frame of its points is "
-            "uncertain. Export it in the camera frame, without a viewpoint."
+            f"{name} has a VIEWPOINT, so its frame is uncertain. Export it in the camera frame."
         )
     if body.startswith(b"binary_compressed"):
         packed, unpacked = struct.unpack_from("<II", content[start : start + 8].ljust(8, b"\0"))
@@ -169,24 +151,19 @@ def _check_pcd_size(content: bytes, name: str) -> None:
         raise InputError(f"{name} claims {points} points but has no room for them; it is damaged.")
 
 
-def _npz_points(unit: str, content: bytes, name: str) -> np.ndarray:
-    """``points_mm``, else ``points``, else the only array (n, 3), in the file's unit."""
-    try:
+def _npz_points(content: bytes, name: str, unit: str) -> np.ndarray:
+    """``points_mm``, else ``points``, else the only array that ``_is_cloud``."""
+    with readable(name, "cannot be read as .npz"):
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             _check_npz_size(archive, name)
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             preferred = [key for key in ("points_mm", "points") if key in arrays.files]
             read = {key: arrays[key] for key in preferred[:1] or arrays.files}
-    except InputError:
-        raise
-    except Exception as error:  # zipfile and numpy raise anything on a damaged file
-        raise InputError(f"{name} cannot be read as .npz: {error or type(error)}.") from error
-    clouds = [key for key, a in read.items() if a.shape[1:] == (3,) and a.dtype.kind in "fiu"]
+    clouds = [key for key, array in read.items() if _is_cloud(array)]
     if len(clouds) != 1:
-        shapes = ", ".join(f"{key} {array.shape}" for key, array in read.items())
+        shapes = ", ".join(f"{key} {array.shape}" for key, array in read.items()) or "nothing"
         raise InputError(
-            f"{name} must hold points_mm, points, or exactly one (n, 3) array of numbers; "
-            f"it has: {shapes or 'nothing'}."
+            f"{name} must hold points_mm, points, or exactly one {_CLOUD_SHAPES}: it has {shapes}."
         )
     if unit == "m" and clouds == ["points_mm"]:
         raise InputError(f"{name}: 'points_mm' is in mm by its name; leave out --unit m.")
@@ -213,26 +190,38 @@ def _check_npy_size(stream: Any, size: int, name: str) -> None:
 
 def _npy(content: bytes, name: str) -> np.ndarray:
     """An array of numbers, in this machine's byte order."""
-    try:
+    with readable(name, "cannot be read as .npy"):
         _check_npy_size(io.BytesIO(content), len(content), name)
         array = np.load(io.BytesIO(content), allow_pickle=False)
-    except InputError:
-        raise
-    except Exception as error:  # numpy raises anything on a damaged file
-        raise InputError(f"{name} cannot be read as .npy: {error or type(error)}.") from error
     if array.dtype.kind not in "fiu":
         raise InputError(f"{name} is an array of {array.dtype}; it must be one of numbers.")
     return array.astype(array.dtype.newbyteorder("="))
 
 
-def _npy_points(content: bytes, name: str) -> np.ndarray:
+def _npy_points(content: bytes, name: str, unit: str) -> np.ndarray:
     array = _npy(content, name)
-    if array.shape[1:] != (3,):
+    if not _is_cloud(array):
         raise InputError(
-            f"{name} is an array {array.shape}; a cloud is n x 3. If it is a depth image, give "
-            "--intrinsics FILE.json with it."
+            f"{name} is an array {array.shape}; a cloud is {_CLOUD_SHAPES}. A depth image takes "
+            "--intrinsics FILE.json."
         )
     return array
+
+
+def _is_cloud(array: np.ndarray) -> bool:
+    """Whole numbers of an image's shape are a picture in colour."""
+    numbers = "fiu" if array.ndim == 2 else "f"
+    return array.ndim in (2, 3) and array.shape[-1] in (3, 6) and array.dtype.kind in numbers
+
+
+# From content, name and unit to numbers in the file's unit, of which x, y, z are the first.
+_CLOUDS: dict[str, Callable[[bytes, str, str], np.ndarray]] = {
+    ".ply": lambda content, name, _: parse_ply_properties(content, name),
+    ".pcd": _pcd_points,
+    ".npz": _npz_points,
+    ".npy": _npy_points,
+}
+CLOUD_SUFFIXES = tuple(_CLOUDS)
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
@@ -255,10 +244,7 @@ def _correction(data: dict[str, Any], path: Path) -> DepthCorrection:
     try:
         return DepthCorrection(scale=scale, offset_mm=offset_mm)
     except InputError as error:
-        raise InputError(
-            f"{path}: {error} These correct a camera by depth_scale and depth_offset_mm; what one "
-            "step of its image is in mm is depth_unit_mm."
-        ) from error
+        raise InputError(f"{path}: {error} The mm of one step are depth_unit_mm.") from error
 
 
 def _camera(path: Path) -> tuple[Intrinsics, dict[str, Any]]:
@@ -266,8 +252,7 @@ def _camera(path: Path) -> tuple[Intrinsics, dict[str, Any]]:
     for key in _DISTORTION_KEYS:
         if any(_numbers(data.get(key, 0), key, path)):
             raise InputError(
-                f"{path}: {key!r} states lens distortion, which depth images here must not have. "
-                "Give the rectified depth stream (a D405's is) and its intrinsics."
+                f"{path}: {key!r} states lens distortion. Give the rectified depth and its camera."
             )
     values = {}
     for key in _PINHOLE_KEYS:
@@ -308,21 +293,15 @@ def read_depth_png(path: Path, intrinsics_path: Path) -> DepthFrame:
 def read_depth(
     path: Path, intrinsics_path: Path, unit_mm: float | None = None
 ) -> tuple[DepthFrame, float]:
-    """A depth image (16-bit PNG or TIFF, a TIFF of floats, or .npy) and its unit, mm per step.
-
-    What ``depths_mm`` says is no return. The unit is ``unit_mm``, else depth_unit_mm of
-    the intrinsics file, else 0.1 for whole numbers and 1000 (metres) for floats. The file's depth
-    correction is applied. Whether the unit can be right is left to ``cloud.check_depth_unit``.
-
-    Raises InputError: no such image, of another size than the intrinsics, or no valid unit.
-    """
+    """A depth image (16-bit PNG or TIFF, a TIFF of floats, or .npy) and its unit, mm per step:
+    ``unit_mm``, else depth_unit_mm of the intrinsics file, else 0.1 for whole numbers and 1000
+    (metres) for floats. The file's depth correction is applied. Whether the unit can be right is
+    left to ``cloud.check_depth_unit``. Raises InputError: no such image, of another size than the
+    intrinsics, or no valid unit."""
     intrinsics, data = _camera(intrinsics_path)
     steps, mode = _image(path, (intrinsics.width, intrinsics.height))
     if not mode.startswith(("I", "F")):
-        raise InputError(
-            f"{path} has pixels of the kind {mode}; allowed: 16-bit grey, or floats in a TIFF or "
-            ".npy."
-        )
+        raise InputError(f"{path} has pixels of the kind {mode}; allowed: 16-bit grey, or floats.")
     default = DEPTH_UNIT_MM if mode.startswith("I") else 1000.0
     stated = data.get("depth_unit_mm", default) if unit_mm is None else unit_mm
     unit_mm = _numbers(stated, "depth_unit_mm", intrinsics_path)[0]
@@ -341,17 +320,16 @@ def read_mask(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
 
 def _image(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, str]:
     """An image's values without its transparency, and its Pillow mode."""
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     if path.suffix.lower() == ".npy":
         array = _npy(read_file(path, LARGEST_FILE), str(path))
         if array.shape != (size[1], size[0]):
             raise InputError(
-                f"{path} is an array {array.shape}; it must be {size[1]} x {size[0]}, rows and "
-                "columns, as the intrinsics say."
+                f"{path} is an array {array.shape}; it must be {size[1]} x {size[0]}, its camera's."
             )
         return array, "F" if array.dtype.kind == "f" else "I"
-    try:
+    with readable(path, "is no 16-bit PNG or TIFF, or TIFF of 32-bit floats, that can be read"):
         content = io.BytesIO(read_file(path, LARGEST_FILE))
         image = Image.open(content, formats=["PNG", "TIFF", "BMP"])
         if (count := getattr(image, "n_frames", 1)) > 1:
@@ -359,19 +337,8 @@ def _image(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, str]:
         if image.size == size:  # known from the header, before anything is decoded
             opaque = image.convert("RGB") if image.mode in ("RGBA", "LA", "PA") else image
             return np.asarray(opaque), image.mode
-    except InputError:
-        raise
-    except UnidentifiedImageError as error:
-        raise InputError(
-            f"{path} is no PNG or TIFF image that is read. Save it with 16-bit numbers, or as a "
-            "TIFF of 32-bit floats."
-        ) from error
-    except Exception as error:  # Pillow raises anything on a damaged file
-        raise InputError(f"{path} cannot be read as a PNG or TIFF image: {error}.") from error
-    raise InputError(
-        f"{path} is {image.width} x {image.height}; it must be {size[0]} x {size[1]}, as the "
-        "intrinsics say."
-    )
+    given, stated = (f"{width} x {height}" for width, height in (image.size, size))
+    raise InputError(f"{path} is {given}; it must be {stated}, as its intrinsics say.")
 
 
 def depth_png(frame: DepthFrame, compress_level: int = 6) -> bytes:
@@ -383,8 +350,7 @@ def depth_png(frame: DepthFrame, compress_level: int = 6) -> bytes:
     returned = np.isfinite(steps)
     if not ((steps[returned] >= 1) & (steps[returned] < 65535)).all():
         raise InputError(
-            f"a depth lies outside {DEPTH_UNIT_MM:g}..{65534 * DEPTH_UNIT_MM:g} mm, which 16 bits "
-            f"of {DEPTH_UNIT_MM:g} mm hold; crop the frame."
+            f"a depth lies outside {DEPTH_UNIT_MM:g}..{65534 * DEPTH_UNIT_MM:g} mm; crop the frame."
         )
     stream = io.BytesIO()
     image = Image.fromarray(np.where(returned, steps, 0).astype(np.uint16))

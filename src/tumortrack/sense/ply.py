@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, readable
 from tumortrack.core.store import write_atomically
 
 _TYPES = {
@@ -40,10 +40,7 @@ def parse_ply_properties(content: bytes, name: str, wanted: Sequence[str] = "xyz
         raise InputError(f"{name}: PLY format {form!r}; allowed: {', '.join(_ORDERS)}.")
     count, columns = _vertex_layout(lines, name)
     if not set(wanted) <= columns.keys():
-        raise InputError(
-            f"{name}: its vertices have {list(columns)}, but no {', '.join(wanted[:-1])} and "
-            f"{wanted[-1]}."
-        )
+        raise InputError(f"{name}: its vertices have {list(columns)}, not {', '.join(wanted)}.")
     body = content[start:]
     if form == "ascii":
         places = [list(columns).index(column) for column in wanted]
@@ -57,7 +54,8 @@ def parse_ply_properties(content: bytes, name: str, wanted: Sequence[str] = "xyz
 
 
 def _vertex_layout(lines: list[list[str]], name: str) -> tuple[int, dict[str, str]]:
-    """Number of vertices, and the type code of each property, in the file's order."""
+    """Number of vertices, and the type code of each property (in lower case, as some programs
+    write X, Y, Z), in the file's order."""
     count, columns, inside = -1, {}, False
     for line in lines:
         match line:
@@ -67,8 +65,10 @@ def _vertex_layout(lines: list[list[str]], name: str) -> tuple[int, dict[str, st
                 raise InputError(f"{name}: the PLY's first element must be 'vertex n'.")
             case ["element", *_]:
                 inside = False
-            case ["property", kind, column] if inside and kind in _TYPES and column not in columns:
-                columns[column] = _TYPES[kind]
+            case ["property", kind, column] if (
+                inside and kind in _TYPES and column.lower() not in columns
+            ):
+                columns[column.lower()] = _TYPES[kind]
             case ["property", *_] if inside:
                 raise InputError(f"{name}: vertex property {' '.join(line)!r} is not understood.")
     if count < 0:
@@ -81,22 +81,17 @@ def _ascii(body: bytes, count: int, wanted: list[int], columns: int, name: str) 
         raise _cut_off(name, count, len(body) // (2 * columns))
     if count == 0:
         return np.empty((0, len(wanted)))
-    try:
+    with readable(name, "has a vertex that is no row of numbers"):
         points = np.loadtxt(
             io.BytesIO(body), comments=None, usecols=wanted, max_rows=count, ndmin=2
         )
-    except ValueError as error:
-        raise InputError(f"{name} has a vertex that is no row of numbers: {error}.") from error
     if len(points) < count:
         raise _cut_off(name, count, len(points))
     return points
 
 
 def _cut_off(name: str, claimed: int, held: int) -> InputError:
-    return InputError(
-        f"{name} claims {claimed} points but has room for {held}; it is cut off or damaged. "
-        "Export it again."
-    )
+    return InputError(f"{name} claims {claimed} points but has room for {held}: it is cut off.")
 
 
 def write_cloud_ply(path: Path, points_mm: np.ndarray, **point_properties: np.ndarray) -> None:

@@ -5,7 +5,6 @@ and meta.json. docs/conventions.md defines them.
 
 from __future__ import annotations
 
-import csv
 import io
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,12 +13,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
+from tumortrack.core import store
 from tumortrack.core.config import check_seed
+from tumortrack.core.csv_tables import read_rows
 from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import read_anatomy, write_anatomy
 from tumortrack.core.mesh_query import contains, labels_of
 from tumortrack.core.organ import KIDNEY, Organ, is_tumor, organ_entry, organ_in
-from tumortrack.core.store import natural, new_folder, read_json, write_atomically, write_json
 from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.sense.files import depth_png, intrinsics_json, read_cloud, read_depth_png
@@ -29,6 +29,7 @@ from tumortrack.sense.ply import write_cloud_ply
 _UNITED = "organ_includes_tumors"
 _STAMP = "stamp_ns"
 _TARGETS = "targets.csv"
+_LARGEST_TABLE = 64 * 2**20  # bytes
 _STICKS_OUT = 0.02  # share of a tumor's volume; smoothing alone makes less stick out
 _ORGAN_SIZE_MM = (5.0, 1000.0)
 TARGETS = 200
@@ -71,7 +72,7 @@ class Scene:
     def write(self, folder: str | Path) -> None:
         """Write a scene folder, all or nothing. Raises InputError: the folder exists already;
         StorageError: the disk refused."""
-        with new_folder(Path(folder)) as aside:
+        with store.new_folder(Path(folder)) as aside:
             write_scene_files(aside, self)
 
 
@@ -79,18 +80,18 @@ def write_scene_files(folder: Path, scene: Scene) -> None:
     """Write a scene's files into an existing folder. Raises StorageError."""
     write_cloud_ply(folder / "cloud.ply", scene.cloud.points_mm)
     if scene.depth is not None:
-        write_atomically(folder / "depth.png", depth_png(scene.depth))
-        write_json(folder / "intrinsics.json", intrinsics_json(scene.depth.intrinsics))
+        store.write_atomically(folder / "depth.png", depth_png(scene.depth))
+        store.write_json(folder / "intrinsics.json", intrinsics_json(scene.depth.intrinsics))
     write_anatomy(folder, scene.reference)
     if scene.targets is not None:
         points = scene.targets.points_ct, scene.targets.points_mm
         table, text = np.column_stack([scene.targets.labels, *points]), io.StringIO()
         numbers, head = ["%d", *["%.5f"] * 6], ",".join(_COLUMNS)  # to 0.01 micrometres
         np.savetxt(text, table, numbers, delimiter=",", header=head, comments="")
-        write_atomically(folder / _TARGETS, text.getvalue().encode())
+        store.write_atomically(folder / _TARGETS, text.getvalue().encode())
     fixed = {"units": "mm", "frame": "camera", _STAMP: scene.cloud.stamp_ns, _UNITED: True}
     meta = {**scene.meta, **fixed, "organ": organ_entry(scene.reference.kind)}
-    write_json(folder / "meta.json", meta)
+    store.write_json(folder / "meta.json", meta)
 
 
 def read_scene(folder: Path) -> Scene:
@@ -102,14 +103,13 @@ def read_scene(folder: Path) -> Scene:
     that cannot be read, surfaces that are open or not in mm."""
     if not folder.is_dir():
         raise InputError(f"{folder} is not a scene folder (it does not exist).")
-    meta = read_json(folder / "meta.json") if (folder / "meta.json").exists() else {}
+    meta = store.read_json(folder / "meta.json") if (folder / "meta.json").exists() else {}
     kind = organ_of_folder(folder, meta)
     for name in ("cloud.ply", f"{kind.name}.ply"):
         if not (folder / name).is_file():
             raise InputError(
                 f"{folder} is not a scene: it lacks {name}. A scene holds cloud.ply, kidney.ply "
-                "(or of another organ's name) and tumor_1.ply, tumor_2.ply, ... in the camera "
-                "frame, in mm."
+                "(or another organ's name), tumor_1.ply, ... in the camera frame, in mm."
             )
     reference = read_anatomy(folder, kind)
     _check_parts(folder, reference)
@@ -148,12 +148,9 @@ def list_scenes(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise InputError(f"{folder} does not exist or is not a folder.")
     visible = (path for path in folder.iterdir() if not path.name.startswith("."))
-    scenes = sorted((path for path in visible if any(path.glob("*.ply"))), key=natural)
+    scenes = sorted((path for path in visible if any(path.glob("*.ply"))), key=store.natural)
     if not scenes:
-        raise InputError(
-            f"{folder} holds no scenes: none of its folders has a cloud.ply and a surface. "
-            "Make some with: tumortrack simulate CASE DATASET."
-        )
+        raise InputError(f"{folder} holds no scenes. Make some: tumortrack simulate CASE DATASET.")
     return scenes
 
 
@@ -161,17 +158,14 @@ def _check_parts(folder: Path, anatomy: Anatomy) -> None:
     last = f"tumor_{len(anatomy.tumors)}"
     strays = {path.stem for path in folder.glob("tumor_*.ply")} - set(anatomy.names)
     if strays:
-        raise InputError(
-            f"{folder}: {sorted(strays)[0]}.ply does not follow {last}.ply. Number the tumors "
-            "1, 2, 3, ... without a gap."
-        )
+        stray = folder / f"{sorted(strays)[0]}.ply"
+        raise InputError(f"{stray} does not follow {last}.ply. Number them without a gap.")
     low, high = _ORGAN_SIZE_MM
     size_mm = anatomy.organ.longest_mm
     if not low <= size_mm <= high:
-        raise InputError(
-            f"{folder / anatomy.kind.name}.ply is {size_mm:.3g} wide; an organ has {low:g} to "
-            f"{high:g} mm. Scale the meshes and the cloud to mm."
-        )
+        path = folder / f"{anatomy.kind.name}.ply"
+        allowed = f"{low:g} to {high:g} mm"
+        raise InputError(f"{path} is {size_mm:.3g} wide; an organ has {allowed}. Scale all to mm.")
 
 
 def _united(folder: Path, anatomy: Anatomy) -> Anatomy:
@@ -216,24 +210,11 @@ def draw_targets(anatomy_ct: Anatomy, seed: int) -> InnerPoints:
 def read_targets(path: Path) -> Targets:
     """Read targets.csv, ours or another program's; further columns are ignored. Raises InputError:
     missing columns or rows, or values that are not finite numbers."""
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            rows = list(csv.DictReader(stream))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path} cannot be read as a table: {error}.") from error
-    missing = [name for name in _COLUMNS if not rows or name not in rows[0]]
-    if missing:
+    table = read_rows(store.read_file(path, _LARGEST_TABLE), str(path), _COLUMNS).numbers(_COLUMNS)
+    labels = table[:, 0]
+    if not np.isfinite(table).all() or not np.isin(labels, np.arange(1, 256)).all():
         raise InputError(
-            f"{path} has no rows, or lacks the columns {', '.join(missing)}. Targets need "
-            f"{','.join(_COLUMNS)}; remove the file if the scene has none."
+            f"{path} has a row that is no target: labels are 1 (organ), 2, 3, ... (tumors), and "
+            "places finite."
         )
-    try:
-        table = np.array([[float(row[name]) for name in _COLUMNS] for row in rows])
-        if not np.isfinite(table).all():
-            raise ValueError("NaN or infinite")
-        labels = table[:, 0]
-        if not np.isin(labels, np.arange(1, 256)).all():
-            raise ValueError("labels must be 1 (organ), 2, 3, ... (tumors)")
-    except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{path} has a row that is not a target: {error}.") from error
     return Targets(table[:, 1:4], table[:, 4:], labels.astype(np.uint8))

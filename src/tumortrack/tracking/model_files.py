@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError, PackageError, StorageError
@@ -151,7 +153,7 @@ def make_model(
         "case_sha256": case.sha256,
         "patient": to_builtins(case.patient),
         "organ": organ_entry(case.anatomy.kind),
-        "warnings": [warning.entry for warning in case.warnings],
+        "warnings": msgspec.to_builtins(case.warnings),
     }
     more = {} if progress is None else {"progress": progress}
     return build_model(case.anatomy, case.up_lps, config, seed, provenance, **more)

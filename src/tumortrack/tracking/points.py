@@ -17,14 +17,14 @@ import io
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 from jaxtyping import Float, Float64
 
 from tumortrack.core.csv_tables import number_in, read_rows, text_of
-from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.errors import InputError, NoEstimate, readable
 from tumortrack.core.estimate import Motion
 from tumortrack.core.store import read_file
 
@@ -32,19 +32,13 @@ FAR_MM = 100.0  # from the organ's box: hardly a point that the user means
 _NEAR_MM = 20.0  # of the organ's box, where points in other units or axes are looked for
 _LARGEST_MM = 1e7  # coordinate in any scanner's frame
 _MOST_BYTES = 64 * 2**20
-_NAMINGS: dict[tuple[str, str, str], tuple[int, int, int]] = {
-    ("ct_x", "ct_y", "ct_z"): (1, 1, 1),
-    ("x", "y", "z"): (1, 1, 1),
-    ("l", "p", "s"): (1, 1, 1),
-    ("r", "a", "s"): (-1, -1, 1),
-}
+_CT = ("ct_x", "ct_y", "ct_z")
+_NAMINGS = {_CT: "LPS", ("x", "y", "z"): "LPS", ("l", "p", "s"): "LPS", ("r", "a", "s"): "RAS"}
 _NOT_PLACED = "0", "0.0", "false", "no"  # as programs write it in that column
 _DEFINED = "defined"  # a column of 3D Slicer's tables: 0 where a point was never placed
 _ADDED = ("camera_x", "camera_y", "camera_z", "std_mm")
-_Signs = tuple[float, float, float]
-_LPS_FROM: dict[str, _Signs] = {"LPS": (1.0, 1.0, 1.0), "RAS": (-1.0, -1.0, 1.0)}
+_LPS_FROM = {"LPS": (1, 1, 1), "RAS": (-1, -1, 1)}
 _OLD_NUMBERS = {"0": "RAS", "1": "LPS"}  # how .fcsv named them before Slicer 4.11
-_Fiducial = tuple[str, str, list[str], bool, _Signs]  # label, description, position, is it placed
 _STATUS, _PLACED = 14, "2"  # an unnamed field of .fcsv, and its value for a placed point
 
 
@@ -86,10 +80,8 @@ def _parse_csv(content: bytes, name: str) -> PointTable:
     place = columns.get(_DEFINED)
     rows = [row for row in table.rows if place is None or row[1][place].lower() not in _NOT_PLACED]
     without = len(table.rows) - len(rows)
-    points = [
-        _numbers_of([row[columns[axis]] for axis in naming], f"{name}, line {line}")
-        for line, row in rows
-    ]
+    points_ct = table._replace(rows=tuple(rows)).numbers(naming) * _LPS_FROM[_NAMINGS[naming]]
+    _check_size(points_ct, [f"{name}, line {line}" for line, _ in rows])
     # The file may be the output for an earlier frame, whose results are replaced.
     kept = [n for column, n in columns.items() if column not in _ADDED]
     replaced = ", ".join(column for column in header if column.lower() in _ADDED)
@@ -99,7 +91,7 @@ def _parse_csv(content: bytes, name: str) -> PointTable:
         f"({_DEFINED} is 0).": without,
     }
     return PointTable(
-        np.reshape(points, (-1, 3)) * np.array(_NAMINGS[naming], float),
+        points_ct,
         tuple(header[n] for n in kept),
         tuple(tuple(row[n] for n in kept) for _, row in rows),
         tuple(note for note, holds in notes.items() if holds),
@@ -109,7 +101,7 @@ def _parse_csv(content: bytes, name: str) -> PointTable:
 class _ControlPoint(msgspec.Struct, rename="camel"):
     label: str = ""
     description: str = ""
-    position: list[float] = []
+    position: tuple[float, float, float] = (np.nan, np.nan, np.nan)
     position_status: str = "defined"
 
 
@@ -123,19 +115,24 @@ class _Markups(msgspec.Struct):
     markups: list[_Markup]
 
 
+class _Fiducial(NamedTuple):
+    label: str
+    description: str
+    point_ct: np.ndarray
+    is_placed: bool
+
+
 def _parse_markups(content: bytes, name: str) -> PointTable:
     """All control points of all markups in the file."""
-    try:
+    with readable(name, "is no markups file of 3D Slicer"):
         data = msgspec.json.decode(content, type=_Markups)
-    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
-        raise InputError(f"{name} is no markups file of 3D Slicer: {error}.") from error
     points: list[_Fiducial] = []
     for markup in data.markups:
         if set(np.atleast_1d(markup.coordinate_units).tolist()) != {"mm"}:
             raise InputError(f"{name}: the unit is {markup.coordinate_units!r}; it must be mm.")
         signs = _signs(markup.coordinate_system, name)
         points += [
-            (p.label, p.description, [*map(str, p.position)], p.position_status == "defined", signs)
+            _Fiducial(p.label, p.description, signs * p.position, p.position_status == "defined")
             for p in markup.control_points
         ]
     return _fiducials(points, name)
@@ -148,66 +145,47 @@ def _parse_fcsv(content: bytes, name: str) -> PointTable:
     columns = re.search(r"^#\s*columns\s*=(.+)$", text, re.MULTILINE)
     signs = _signs(system.group(1) if system else "missing", name)
     names = [n.strip() for n in columns.group(1).split(",")] if columns else []
-    if not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
+    if not columns or not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
         raise InputError(f"{name}: its header lacks '# columns = id,x,y,z,...'. Save it again.")
-    body = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    try:
-        rows = list(csv.reader(io.StringIO("\n".join(body))))
-    except csv.Error as error:
-        raise InputError(f"{name} is damaged: {error}. Save it again.") from error
     points: list[_Fiducial] = []
+    with readable(name, "is damaged"):  # below the header # may begin a name
+        rows = [row for row in csv.reader(io.StringIO(text[columns.end() :])) if any(row)]
     for row in rows:
         cells = dict(zip(names, row, strict=False))
-        placed = len(row) <= _STATUS or row[_STATUS] == _PLACED
-        position = [cells.get(axis, "") for axis in "xyz"]
-        points.append((cells.get("label", ""), cells.get("desc", ""), position, placed, signs))
+        label, is_placed = cells.get("label", ""), len(row) <= _STATUS or row[_STATUS] == _PLACED
+        where = f"{name}, point {label!r}"
+        place = [number_in(cells.get(axis, ""), where) for axis in "xyz" if is_placed] or [0.0] * 3
+        points.append(_Fiducial(label, cells.get("desc", ""), signs * place, is_placed))
     return _fiducials(points, name)
 
 
-def _signs(system: str, name: str) -> _Signs:
+def _signs(system: str, name: str) -> np.ndarray:
     known = _OLD_NUMBERS.get(system, system)
     if known not in _LPS_FROM:
-        raise InputError(
-            f"{name}: its coordinate system is {system}; it must be LPS or RAS. Save it in 3D "
-            "Slicer again."
-        )
-    return _LPS_FROM[known]
+        raise InputError(f"{name}: its coordinate system is {system}; it must be LPS or RAS.")
+    return np.array(_LPS_FROM[known], float)
 
 
 def _fiducials(points: list[_Fiducial], name: str) -> PointTable:
-    missing = [label for label, _, _, placed, _ in points if not placed]
-    rows, points_ct = [], []
-    for label, description, position, placed, signs in points:
-        if placed:
-            point_ct = np.multiply(_numbers_of(position, f"{name}, point {label!r}"), signs)
-            points_ct.append(point_ct)
-            rows.append((label, description, *(f"{number:.5f}" for number in point_ct)))
-    return PointTable(
-        np.array(points_ct).reshape(-1, 3),
-        ("label", "description", "ct_x", "ct_y", "ct_z"),
-        tuple(rows),
-        (f"{name}: left out {len(missing)} that have no place yet: {', '.join(missing)}.",)
-        if missing
-        else (),
-    )
+    missing = [point.label for point in points if not point.is_placed]
+    placed = [point for point in points if point.is_placed]
+    points_ct = np.reshape([point.point_ct for point in placed], (-1, 3))
+    _check_size(points_ct, [f"{name}, point {point.label!r}" for point in placed])
+    note = f"{name}: left out {len(missing)} that have no place yet: {', '.join(missing)}."
+    rows = tuple((*point[:2], *(f"{x:.5f}" for x in point.point_ct)) for point in placed)
+    columns = ("label", "description", *_CT)
+    return PointTable(points_ct, columns, rows, (note,) if missing else ())
 
 
 _PARSERS = {".json": _parse_markups, ".fcsv": _parse_fcsv, ".csv": _parse_csv}
 
 
-def _numbers_of(texts: list[str], where: str) -> tuple[float, float, float]:
-    """Three finite numbers; ``where``: in the file, for messages."""
-    shown = ", ".join(texts)[:80]
-    try:
-        x, y, z = (number_in(text, where) for text in texts)
-    except (InputError, ValueError) as error:
-        raise InputError(f"{where}: {shown!r} is no point: it takes x, y, z as numbers.") from error
-    if not np.abs([x, y, z]).max() < _LARGEST_MM:  # also false for NaN
-        raise InputError(
-            f"{where}: {shown!r} is NaN, infinite or more than {_LARGEST_MM / 1e6:g} km away. "
-            "Correct or remove the point."
-        )
-    return x, y, z
+def _check_size(points_ct: Float[np.ndarray, "n 3"], where: list[str]) -> None:
+    for point_ct, place in zip(points_ct.tolist(), where, strict=True):
+        if not all(abs(number) < _LARGEST_MM for number in point_ct):  # also false for NaN
+            raise InputError(
+                f"{place}: {point_ct} is NaN, infinite or more than {_LARGEST_MM / 1e6:g} km away."
+            )
 
 
 def check_near_organ(
@@ -238,10 +216,7 @@ def check_near_organ(
     far = distance() > FAR_MM
     away = f"more than {FAR_MM:g} mm away from {box}"
     if far.all():
-        raise InputError(
-            f"{name}: every point lies {away}. Points must be in the frame of the CT that the case "
-            "was made from, LPS, mm."
-        )
+        raise InputError(f"{name}: every point lies {away}. Give them in the CT's frame.")
     if not far.any():
         return ()
     count = f"{far.sum()} of {len(far)} points"

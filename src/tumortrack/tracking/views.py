@@ -30,7 +30,7 @@ from tumortrack.sense.region import Hints, organ_points
 from tumortrack.tracking.options import LocateOptions
 
 NO_CLOUD = Path("-")
-_NEAR = range(-3, 4)  # pixels from the one of --at
+_NEAR = 3  # pixels from the one of --at
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,8 +122,8 @@ def read_views(paths: Sequence[Path], options: LocateOptions) -> list[View]:
     count = len(paths)
     if len(cameras) not in (1, count):
         raise InputError(
-            f"--intrinsics is given {len(cameras)} times for {count} view{'s' * (count > 1)}: "
-            "give it once for all of them, or once for each, in their order."
+            f"--intrinsics is given {len(cameras)} times for {count} view{'s' * (count > 1)}: give "
+            "it once, or once for each."
         )
     cameras = cameras if len(cameras) == count else cameras * count
     return [_read_view(*pair, options) for pair in zip(paths, cameras, strict=True)]
@@ -132,32 +132,23 @@ def read_views(paths: Sequence[Path], options: LocateOptions) -> list[View]:
 def _read_view(path: Path, intrinsics: Path | None, options: LocateOptions) -> View:
     if path == NO_CLOUD:
         if options.evidence is None:
-            raise InputError(
-                "without a cloud (-) give --evidence FILE with twelve touches or more."
-            )
+            raise InputError("without a cloud (-) give --evidence FILE with touches.")
         return View(path, SensorCloud(np.zeros((0, 3), np.float32)))
     suffix = path.suffix.lower()
     if suffix in DEPTH_SUFFIXES and (suffix not in CLOUD_SUFFIXES or intrinsics is not None):
         if intrinsics is None:
             raise InputError(f"{path} is a depth image: give --intrinsics FILE.json with it.")
         if options.unit != "mm":
-            raise InputError(
-                "--unit is for clouds; of a depth image give --depth-unit, the mm of one step, or "
-                "have it in the intrinsics file as depth_unit_mm."
-            )
+            raise InputError("--unit is for clouds; of a depth image give --depth-unit.")
         frame, unit_mm = read_depth(path, intrinsics, options.depth_unit)
-        if options.depth_unit is not None:
-            stated_by = "--depth-unit"
-        elif "depth_unit_mm" in read_json(intrinsics):
-            stated_by = f"stated in {intrinsics.name}"
-        else:
-            stated_by = "the default"
+        stated_by = "--depth-unit"
+        if options.depth_unit is None:
+            in_file = "depth_unit_mm" in read_json(intrinsics)
+            stated_by = f"stated in {intrinsics.name}" if in_file else "the default"
         return View(path, frame, unit=(unit_mm, stated_by))
     if suffix in CLOUD_SUFFIXES and (intrinsics is not None or options.depth_unit is not None):
         option = "--intrinsics" if intrinsics is not None else "--depth-unit"
-        raise InputError(
-            f"{option} is for depth images ({', '.join(DEPTH_SUFFIXES)}); {path} is a cloud."
-        )
+        raise InputError(f"{option} is for depth images; {path} is a cloud.")
     cloud, notes = read_cloud(path, options.unit)
     check_cloud(cloud)  # before the crop, which would only say that nothing lies in range
     return View(path, cloud, notes)
@@ -168,10 +159,7 @@ def read_places(poses: Path | None, views: int) -> tuple[str, tuple[Affine, ...]
     if poses is None and views == 1:
         return "", ()
     if poses is None or views == 1:
-        raise InputError(
-            f"{views} view{'s' * (views > 1)} with{'out' * (poses is None)} --poses: give "
-            "--poses FILE with several views (locate MODEL CLOUD CLOUD ... OUT), and only then."
-        )
+        raise InputError("give --poses FILE with several views, and only with several.")
     return read_poses(poses, views)
 
 
@@ -190,18 +178,13 @@ def _picked_mm(frame: DepthFrame, column: int, row: int) -> Float[np.ndarray, " 
     pixel, or no return near it."""
     camera = frame.intrinsics
     if not (0 <= column < camera.width and 0 <= row < camera.height):
-        raise InputError(
-            f"--at {column} {row} is outside the depth image; COLUMN is 0 to {camera.width - 1}, "
-            f"ROW 0 to {camera.height - 1}."
-        )
-    pixels = [(column + x, row + y) for x in _NEAR for y in _NEAR]
-    pixels.sort(key=lambda pixel: (pixel[0] - column) ** 2 + (pixel[1] - row) ** 2)
-    index = np.array([y * camera.width + x for x, y in pixels
-                      if 0 <= x < camera.width and 0 <= y < camera.height])  # fmt: skip
-    depth_mm = frame.depth_mm.ravel()[index].astype(float)
-    index, depth_mm = index[np.isfinite(depth_mm)], depth_mm[np.isfinite(depth_mm)]
-    if not len(index):
-        raise InputError(
-            f"--at {column} {row}: the depth image has no return there. Give another pixel."
-        )
-    return deproject_pixels(index[:1], depth_mm[:1], camera)[0].astype(float)
+        size = f"{camera.width} x {camera.height}"
+        raise InputError(f"--at {column} {row} is outside the depth image of {size} pixels.")
+    left, top = max(0, column - _NEAR), max(0, row - _NEAR)
+    near = frame.depth_mm[top : row + _NEAR + 1, left : column + _NEAR + 1]
+    pixels = np.argwhere(np.isfinite(near.T)) + [left, top]
+    if not len(pixels):
+        raise InputError(f"--at {column} {row} has no return. Give another pixel.")
+    x, y = pixels[np.square(pixels - [column, row]).sum(1).argmin()]
+    depth_mm = frame.depth_mm[y, [x]].astype(float)
+    return deproject_pixels(np.array([y * camera.width + x]), depth_mm, camera)[0].astype(float)

@@ -10,7 +10,7 @@ import io
 import logging
 import re
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, suppress
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -18,7 +18,8 @@ from typing import Any
 
 import msgspec
 
-from tumortrack.core.errors import InputError
+from tumortrack.core.config import from_builtins
+from tumortrack.core.errors import InputError, readable
 from tumortrack.core.evidence import Evidence
 from tumortrack.core.store import natural
 from tumortrack.live.values import Observation
@@ -34,6 +35,7 @@ SUFFIXES = (".mcap", ".db3", ".bag")
 ESTIMATES = "/tumortrack/"  # topics of our own estimates: no input
 OWN_DEPTH = "/camera/depth/image_rect"  # of the sink ``recording``
 MASK_TOPIC, PICTURE_TOPIC = "/camera/mask", "/camera/color/image_raw"
+_NO_BAG = "is no bag that can be read, or is damaged from here on"
 _REALSENSE = "/device_0/"  # prefix of all topics of the RealSense SDK
 # https://mcap.dev/spec
 _MAGIC = b"\x89MCAP0\r\n"
@@ -61,7 +63,7 @@ class BagRecording:
         self._readers: list[Any] = []
         with ExitStack() as opened:
             for file in files:
-                with _guarded(path):
+                with readable(path, _NO_BAG):
                     self._readers.append(_opened(file))
                 opened.callback(self._readers[-1].close)
             self._types = {c.topic: c.msgtype for r in self._readers for c in r.connections}
@@ -124,12 +126,10 @@ class BagRecording:
         """What became known with the frame of this stamp."""
         if message is None:
             return ()
-        try:
-            known = msgspec.json.decode(message.data, type=FrameEvidence)
-        except (msgspec.MsgspecError, AttributeError, InputError) as error:
-            raise InputError(
-                f"{self._path}: its {self._evidence_topic} is damaged: {error}."
-            ) from error
+        where, fault = f"{self._path}: its {self._evidence_topic}", "is damaged"
+        with readable(where, fault):
+            given = msgspec.json.decode(message.data)
+            known = from_builtins(given, FrameEvidence, f"{where} {fault}")
         return known.evidence if known.stamp_ns == stamp_ns else ()
 
     def _all(self, topics: set[str]) -> Iterator[tuple[str, Any, int]]:
@@ -142,7 +142,7 @@ class BagRecording:
             while entry is not None:
                 entry = None
                 try:
-                    with _guarded(self._path):
+                    with readable(self._path, _NO_BAG):
                         entry = next(raw, None)
                     if entry is not None:
                         topic = entry[0].topic
@@ -175,14 +175,10 @@ class BagRecording:
             return candidates[0]
         if any(topic.startswith(_REALSENSE) for topic in self._types):
             raise InputError(
-                f"{self._path} was recorded by the RealSense SDK, whose depth unit stands apart: "
-                f"give the source realsense:{self._path}."
+                f"{self._path} is of the RealSense SDK. Give the source realsense:{self._path}."
             )
         if not usable:
-            raise InputError(
-                f"{self._path} holds no depth images and no clouds (topics of "
-                f"{' or '.join(_KINDS)}; those under {ESTIMATES} are estimates)."
-            )
+            raise InputError(f"{self._path} holds no depth images and no clouds, as cameras send.")
         raise InputError(
             f"{self._path}: which topic holds the depth images or clouds? Say topic=NAME; "
             f"candidates: {', '.join(candidates or usable)}."
@@ -230,13 +226,11 @@ def bag_contents(path: Path) -> tuple[dict[str, int], float]:
     counts: dict[str, int] = {}
     times_ns: list[int] = []
     for file in bag_files(path):
-        with _guarded(path):
-            reader = _opened(file)
-            with closing(reader):
-                kinds = [c for c in reader.connections if _is_input(c.topic, c.msgtype)]
-                for connection, time_ns, _ in reader.messages(kinds) if kinds else ():
-                    counts[connection.topic] = counts.get(connection.topic, 0) + 1
-                    times_ns.append(time_ns)
+        with readable(path, _NO_BAG), closing(_opened(file)) as reader:
+            kinds = [c for c in reader.connections if _is_input(c.topic, c.msgtype)]
+            for connection, time_ns, _ in reader.messages(kinds) if kinds else ():
+                counts[connection.topic] = counts.get(connection.topic, 0) + 1
+                times_ns.append(time_ns)
     return counts, (max(times_ns) - min(times_ns)) * 1e-9 if times_ns else 0.0
 
 
@@ -272,19 +266,6 @@ def _opened(path: Path) -> Any:
     reader.bio, reader.data_end = path.open("rb"), end
     reader.meta_scan()
     return reader
-
-
-@contextmanager
-def _guarded(path: Path) -> Iterator[None]:
-    """Errors inside become an InputError that names the bag."""
-    try:
-        yield
-    except InputError:
-        raise
-    except Exception as error:  # rosbags, sqlite and unpackers raise anything on a damaged bag
-        raise InputError(
-            f"{path} is no bag that can be read, or is damaged from here on: {error}."
-        ) from error
 
 
 def _profile(path: Path) -> str | None:

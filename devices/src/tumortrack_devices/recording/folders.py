@@ -53,13 +53,9 @@ def folder_frames(path: Path, fps: float, unit: Literal["mm", "m"]) -> list[Reco
     ]
     frame_paths, read = next((kind for kind in kinds if kind[0]), ([], _read_scene))
     if not frame_paths:
-        lack = (
-            f"its depth images need {INTRINSICS} beside them"
-            if images
-            else "it holds none of these"
-        )
+        lack = f"; its depth images lack {INTRINSICS}" if images else ""
         raise InputError(
-            f"{path} is no recording: {lack}. Allowed: a folder of clouds "
+            f"{path} is no recording{lack}. Allowed: a folder of clouds "
             f"({', '.join(files.CLOUD_SUFFIXES)}), of depth images "
             f"({', '.join(files.DEPTH_SUFFIXES)}) with {INTRINSICS}, of scene folders, a rosbag2 "
             "folder, .mcap, .db3 or .bag."

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, readable
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
 from tumortrack.live.values import Observation
 from tumortrack.sense.camera import plausible
@@ -84,10 +84,8 @@ def _place(field: Any, step: int) -> tuple[int, str]:
             f"{field.count}; it must be one FLOAT32 (7) or FLOAT64 (8), in metres."
         )
     if offset + int(code[1]) > step:
-        raise InputError(
-            f"a cloud came whose {field.name} lies at byte {offset}, beyond its points of {step} "
-            "bytes; it is damaged."
-        )
+        where = f"lies at byte {offset}, beyond its points of {step} bytes"
+        raise InputError(f"a cloud came whose {field.name} {where}; it is damaged.")
     return offset, code
 
 
@@ -103,8 +101,8 @@ def depth_of(image: Any, info: Any, rectified: bool = False, unit_mm: float = 1.
     names = frame_of(image), frame_of(info)
     if all(names) and names[0] != names[1]:
         raise InputError(
-            f"a depth image in the frame {names[0]!r} came with a camera_info of {names[1]!r}, "
-            "which is another camera's. Name the camera_info of this very image."
+            f"a depth image in the frame {names[0]!r} came with a camera_info of {names[1]!r}. "
+            "Name the camera_info of this very image."
         )
     intrinsics = _intrinsics_of(info, rectified)
     values = _pixels(image, DEPTHS, "a depth image")
@@ -126,18 +124,16 @@ def image_of(message: Any, messages: Messages) -> Any:
     encoding, _, packing = str(message.format).partition(";")
     if encoding not in DEPTHS or packing.split() not in (["compressedDepth"], _PNG):
         raise InputError(
-            f"a packed image came with the format {str(message.format)[:60]!r}; it must be a depth "
-            "image of image_transport's compressedDepth with PNG. Else give the raw topic."
+            f"a packed image came with the format {str(message.format)[:60]!r}; allowed: "
+            "compressedDepth as PNG. Else give the raw topic."
         )
     data = bytes(message.data)
-    try:
+    with readable("a packed depth image", "came that is damaged"):
         with Image.open(io.BytesIO(data[_PACKED.size :]), formats=["PNG"]) as picture:
             if not picture.mode.startswith("I;16") or max(picture.size) > _LONGEST_SIDE:
                 raise ValueError(f"mode {picture.mode}, {picture.width} x {picture.height}")
             depth = np.asarray(picture)
         _, a, b = _PACKED.unpack_from(data)
-    except Exception as error:  # Pillow raises anything on a damaged file
-        raise InputError(f"a packed depth image came that is damaged ({error}).") from error
     if DEPTHS[encoding] == "f4":
         with np.errstate(all="ignore"):  # pixels without return are dropped later
             depth = np.where(depth == 0, np.nan, a / (depth - np.float64(b))).astype(np.float32)
@@ -175,22 +171,13 @@ def _intrinsics_of(info: Any, rectified: bool) -> Intrinsics:
     roi = info.roi
     whole = (int(roi.width), int(roi.height)) in ((0, 0), (width, height))
     if not whole or roi.x_offset or roi.y_offset or max(info.binning_x, info.binning_y) > 1:
-        raise InputError(
-            "a camera_info came with binning or a region of interest, which is not supported. Send "
-            "the whole image."
-        )
+        raise InputError("a camera_info came with binning or a region. Send the whole image.")
     lens = {name.lower(): value for name, value in vars(info).items()}  # ROS 1 has capitals
     matrix = np.asarray(lens["p" if rectified else "k"], float).reshape(3, -1)
     if rectified and (matrix[:, 3] != 0).any():
-        raise InputError(
-            "a camera_info came whose P has a shift, as of a stereo pair's right camera. Give "
-            "the depth image of the left one."
-        )
+        raise InputError("a camera_info came whose P has a shift. Give the left camera's depth.")
     if not rectified and (np.asarray(lens["d"], float) != 0).any():
-        raise InputError(
-            "a camera_info came that states lens distortion (D), which depth images here must "
-            "not have. Give the rectified depth image, and say that it is (rectified=true)."
-        )
+        raise InputError("a camera_info has distortion (D); give rectified depth (rectified=true).")
     if matrix[0, 1] != 0:
         raise InputError("a camera_info came whose pixels are skewed, which is not supported.")
     fx, cx, fy, cy = matrix[0, 0], matrix[0, 2], matrix[1, 1], matrix[1, 2]
@@ -202,10 +189,8 @@ def _pixels(image: Any, allowed: dict[str, str], what: str) -> np.ndarray:
     """The image (height, width) or (height, width, channels), in this machine's byte order."""
     code = allowed.get(image.encoding)
     if code is None:
-        raise InputError(
-            f"{what} came with the encoding {str(image.encoding)[:40]!r}; allowed: "
-            f"{', '.join(allowed)}."
-        )
+        given = str(image.encoding)[:40]
+        raise InputError(f"{what} came with the encoding {given!r}; allowed: {', '.join(allowed)}.")
     width, height, step = int(image.width), int(image.height), int(image.step)
     data, wide = np.frombuffer(image.data, np.uint8), np.dtype(code).itemsize
     if step in (0, data.nbytes) and width * wide * height == data.nbytes:  # as of clouds

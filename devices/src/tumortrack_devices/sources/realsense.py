@@ -105,10 +105,7 @@ class RealSenseSource:
         self._sensor, profile = _depth_stream(rs, device, None if self._playback else config)
         given = profile.get_intrinsics()
         if any(given.coeffs):
-            raise InputError(
-                f"the RealSense's depth image is distorted ({given.model}, {list(given.coeffs)}); "
-                "a rectified stream is needed. Calibrate the camera."
-            )
+            raise InputError(f"the RealSense's depth is distorted ({given.model}). Calibrate it.")
         lens = given.fx, given.fy, given.ppx, given.ppy
         self._intrinsics = plausible(Intrinsics(given.width, given.height, *lens), "the RealSense")
         self._unit_mm = float(f"{self._sensor.get_option(rs.option.depth_units) * 1000:.6g}")
@@ -141,10 +138,7 @@ class RealSenseSource:
             self.dropped += 1
             self._untimed += 1
             if self._untimed > _MOST_UNTIMED:
-                raise InputError(
-                    "the RealSense's clock is not tied to this machine's: its frames have no "
-                    "global time. Give global_time=false."
-                )
+                raise InputError("the RealSense gives no global time. Give global_time=false.")
             return None
         raw = np.asarray(frame.get_data())
         depth_mm = depths_mm(raw, self._unit_mm)

@@ -62,9 +62,7 @@ class OpenIgtLinkToolConfig(TipConfig, frozen=True, kw_only=True, tag="openigtli
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.port_text.isdecimal() or not 0 <= int(self.port_text) <= 65535:
-            raise InputError(
-                f"openigtlink: {self.address!r} is no address; write HOST, HOST:PORT or PORT."
-            )
+            raise InputError(f"openigtlink: {self.address!r} is not HOST, HOST:PORT or PORT.")
 
     @property
     def server(self) -> str:
@@ -143,9 +141,8 @@ class OpenIgtLinkTool(TipTool):
         """What comes, where the tool's pose does not."""
         others = ", ".join(f"{kind} of {device!r}" for kind, device in [*self._came])
         return (
-            f"it is connected, but no TRANSFORM of {self._device!r} comes; "
-            f"{f'what comes is {others}' if others else 'nothing comes at all'}. Allowed: name= as "
-            "it is sent, and the type TRANSFORM"
+            f"it is connected, but no TRANSFORM of {self._device!r} comes; what comes is "
+            f"{others or 'nothing'}. Allowed: name= as it is sent"
         )
 
     def _time_of(self, header: Header) -> int:
@@ -159,8 +156,8 @@ class OpenIgtLinkTool(TipTool):
             self._stamped = -most_ns * (most_ns > _LAG_NS) - _AHEAD_NS <= late_ns <= most_ns
             if not self._stamped:
                 self._heard_fault = (
-                    f"its stamps lie {late_ns * 1e-9:.2f} s behind this machine's clock, so they "
-                    "do not count: poses have the time of their arrival. Synchronise both clocks"
+                    f"its stamps lie {late_ns * 1e-9:.2f} s behind this machine's clock: poses "
+                    "have the time of their arrival. Synchronise both clocks"
                 )
         return header.stamp_ns if self._stamped else now_ns
 
@@ -186,30 +183,26 @@ class OpenIgtLinkTool(TipTool):
         if header.device == self._contact_device:
             text = igtl.unpack_string(content).strip().lower()
             if text not in _MEANT:
-                raise igtl.ProtocolError(
-                    f"the STRING {header.device} is {text!r}; allowed: 1 or 0."
-                )
+                raise igtl.ProtocolError(f"{header.device} is {text!r}; allowed: 1 or 0.")
             self.contact(self._time_of(header), _MEANT[text])
 
     def _hear_points(self, header: Header, content: bytes, _: Mapping[str, str]) -> None:
-        device = header.device
         for number, (label, group, place_mm) in enumerate(igtl.unpack_points(content)):
-            part = self._part(label, group, device)
+            part = self._part(label, group, header.device)
             fields = {"part": part, "tip_mm": self.config.tip_mm}
-            self._draw((device, number), Touch, place_mm[None], fields)
+            self._draw((header.device, number), Touch, place_mm[None], fields)
 
     def _hear_outline(self, header: Header, content: bytes, _: Mapping[str, str]) -> None:
-        device = header.device
         places_mm = _thinned(igtl.unpack_polydata_points(content))
         if len(places_mm):
-            self._draw((device, -1), Outline, places_mm, {"part": self._part(device)})
+            part = self._part(header.device)
+            self._draw((header.device, -1), Outline, places_mm, {"part": part})
 
     def _part(self, *names: str) -> str:
         parts = self.context.touchable
         if (part := next((one for one in names if one in parts), None)) is None:
             raise igtl.ProtocolError(
-                f"{names[0]!r} is drawn, which is no part; name it as what it lies on: "
-                f"{', '.join(parts)}."
+                f"{names[0]!r} is drawn, which is no part; allowed: {', '.join(parts)}."
             )
         return part
 
