@@ -96,7 +96,7 @@ def _smoothed(cloud: SensorCloud, noise: DepthNoise) -> tuple[SensorCloud, Point
 
     rng = np.random.default_rng(0)
     points_mm = thin_cloud(cloud, _MOST_POINTS, rng).points_mm.astype(float)
-    tree, drawn = cKDTree(points_mm), points_mm[: _SMOOTHED]
+    tree, drawn = cKDTree(points_mm), points_mm[:_SMOOTHED]
     wanted = int(np.clip(TERMS / 2 * (noise.white_mm / _LEFT_MM) ** 2, *_NEIGHBOURS))
     apart_mm, near = tree.query(drawn, min(wanted, len(points_mm)))
     count = int(np.median((apart_mm < _RADIUS_MM).sum(1)))

@@ -72,9 +72,12 @@ def judged(estimate: Estimate, looks: Sequence[Look], strictly: bool = False) ->
         strictly: the fit must be no worse than usual, whatever the camera sees round the organ.
     """
     views = _organ_before_cameras(estimate, looks)
-    behind = [(*view, _behind_mm(look)) for view, look in zip(views, looks, strict=False)]
-    images = [seen_through(*view) for view in behind if isinstance(view[1], DepthFrame)]
-    clouds = [cloud_shares(*view) for view in behind if isinstance(view[1], SensorCloud)]
+    images, clouds = [], []
+    for (organ, seen), look in zip(views, looks, strict=False):  # a network takes the first alone
+        if isinstance(seen, DepthFrame):
+            images.append(seen_through(organ, seen, _behind_mm(look)))
+        else:
+            clouds.append(cloud_shares(organ, seen, _behind_mm(look)))
     unseen = max((share for _, share in clouds), default=0.0)
     rim_share = min((share for _, share, _ in images), default=0.0) if not clouds else 0.0
     by_depth = max((share for share, _, _ in images), default=0.0)

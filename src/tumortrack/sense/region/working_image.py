@@ -101,8 +101,9 @@ class WorkingImage:
 
     ``depth_mm`` (h, w) is float32, NaN without a return; ``taken`` (h, w), uint8, holds the states
     above, which the steps write. Each of its pixels is one of ``step_px`` by ``step_px`` of the
-    frame's, averaged over ``window_px`` to either side. ``remaining(taken)``: indices (n,) of the frame's or cloud's
-    points that are still ORGAN; ``points(indices)``: these (n, 3), camera frame, mm.
+    frame's, averaged over ``window_px`` to either side. ``remaining(taken)``: indices (n,) of the
+    frame's or cloud's points that are still ORGAN; ``points(indices)``: these (n, 3), camera frame,
+    mm.
     """
 
     depth_mm: np.ndarray
@@ -163,7 +164,10 @@ def image_of_frame(
     camera, sampled = frame.intrinsics, sampled_pixels(frame)
     step = sampled[0].step
     reach = 0 if noise is None else window_px(frame, noise)
-    depth_mm = smoothed(frame, sampled, noise, reach) if reach else frame.depth_mm[sampled].copy()
+    if noise is not None and reach:
+        depth_mm = smoothed(frame, sampled, noise, reach)
+    else:
+        depth_mm = frame.depth_mm[sampled].copy()
     taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
 
     def points(pixel: np.ndarray) -> np.ndarray:
