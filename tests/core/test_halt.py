@@ -31,4 +31,6 @@ def test_halts_that_differ_in_numbers_alone_are_the_same():
 
 def test_every_kind_has_one_sentence():
     assert {*halt._SENTENCES} == {*get_args(halt.HaltKind)}
-    assert sorted([*report._SAID.poor, *report._SAID.none]) == sorted(get_args(report.Kind))
+    assert sorted([*report._SAID.poor, *report._SAID.none, *report._SAID.case]) == sorted(
+        get_args(report.Kind)
+    )

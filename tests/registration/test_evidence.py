@@ -338,8 +338,8 @@ def test_what_a_tool_holds_is_where_the_tool_is_until_it_slips(slim_model):
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: Touch(place_mm=(0.0, 0.0, 5000.0)), "both in mm"),
-        (lambda: Touch(place_mm=(0.0, float("nan"), 100.0)), "both in mm"),
+        (lambda: Touch(place_mm=(0.0, 0.0, 5000.0)), "place_mm"),
+        (lambda: Touch(place_mm=(0.0, float("nan"), 100.0)), "place_mm"),
         (lambda: Outline(places_mm=(), part="kidney"), "x, y, z"),
         (lambda: Outline(places_mm=np.ones((3, 2)), part="kidney"), "x, y, z"),
         (lambda: Touch(place_mm=((0.0, 0.0, 100.0),)), "x, y, z"),

@@ -78,7 +78,7 @@ class Looks:
     shifts: Float64[np.ndarray, "k 6"]
     evidence: EvidenceTerms | None = None
     noise: PointNoise = PointNoise()  # noqa: RUF009 (an immutable tuple)
-    candidates_mm: Points | None = None
+    candidates_mm: Float[np.ndarray, "c 3"] | None = None
 
     @classmethod
     def of(
@@ -87,7 +87,7 @@ class Looks:
         camera_from_look: Sequence[Affine] = (),
         evidence: EvidenceTerms | None = None,
         noises: Iterable[PointNoise] = (),
-        candidates_mm: Points | None = None,
+        candidates_mm: Float[np.ndarray, "c 3"] | None = None,
     ) -> Looks:
         """Points of each look in its own camera's frame; further ones with where it is."""
         moved = [*points_mm[:1], *map(_moved, camera_from_look, points_mm[1:])]
