@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import signal
+import sys
 from collections.abc import Iterator
 from importlib import import_module
 
 import pytest
 
 from clock import until
+from tumortrack.core import process
 from tumortrack.core.process import interrupt_between_imports, undisturbed
 
 GREEDY = """
@@ -38,6 +40,16 @@ def greedy(tmp_path, monkeypatch) -> Iterator[str]:
 
 def test_an_import_may_end_and_the_interrupt_is_not_lost(greedy):
     interrupt_between_imports()
+    with pytest.raises(KeyboardInterrupt):
+        until(lambda: not import_module(greedy).whole, "the interrupt")
+    assert import_module(greedy).whole
+
+
+def test_it_waits_for_long_only_for_those_that_are_known_to_catch_all(greedy, monkeypatch):
+    interrupt_between_imports(retries=0)
+    assert not import_module(greedy).whole
+    sys.modules.pop(greedy)
+    monkeypatch.setattr(process, "_CATCHING_ALL", {greedy})
     with pytest.raises(KeyboardInterrupt):
         until(lambda: not import_module(greedy).whole, "the interrupt")
     assert import_module(greedy).whole

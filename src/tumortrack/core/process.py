@@ -22,6 +22,7 @@ _CGROUPS = Path("/sys/fs/cgroup")
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_MMAP_MAX = -1, -3, -4  # glibc's malloc.h
 _MMAP_MAX = 65536  # glibc's default
 _RETRY_S = 0.02  # after which an import may have ended
+_CATCHING_ALL = {"trimesh"}  # when they import others
 _SMALL = 32 * 2**20  # bytes: the largest threshold that glibc accepts
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -107,22 +108,36 @@ def undisturbed() -> Iterator[None]:
             signal.raise_signal(signal.SIGINT)
 
 
-def interrupt_between_imports() -> None:
-    """Let Ctrl-C wait until no module is being imported: libraries (trimesh) catch all that is
-    raised in there, and go on as if nothing had been, or with half of themselves."""
+def interrupt_between_imports(retries: int = 100) -> None:
+    """Let Ctrl-C wait while modules are imported: some libraries catch all that is raised in there,
+    and go on as if nothing had been, or with half of themselves. After ``retries``, 2 s, it waits
+    for those alone that are known to do so."""
     if sys.platform == "win32" or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         return  # no timer; or a shell in the background wants it to be ignored
 
     def came(number: int, frame: FrameType | None) -> None:
-        while frame is not None:
-            if frame.f_code.co_filename.startswith("<frozen importlib."):
-                signal.setitimer(signal.ITIMER_REAL, _RETRY_S)
-                return
-            frame = frame.f_back
+        nonlocal retries
+        packages = _importing(frame)
+        if packages & _CATCHING_ALL or (packages and retries > 0):
+            retries -= 1
+            signal.setitimer(signal.ITIMER_REAL, _RETRY_S)
+            return
         raise KeyboardInterrupt
 
     signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
     signal.signal(signal.SIGINT, came)
+
+
+def _importing(frame: FrameType | None) -> set[str]:
+    """The packages of which a module is being imported in a frame or its callers."""
+    packages, module = set[str](), ""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib."):
+            packages.add(module.partition(".")[0])
+        elif frame.f_code.co_name == "<module>":
+            module = str(frame.f_globals.get("__name__"))
+        frame = frame.f_back
+    return packages
 
 
 def keep_freed_memory() -> None:
