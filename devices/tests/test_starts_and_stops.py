@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -94,6 +95,7 @@ def again_and_again(once: Callable[[], None]) -> None:
         ("sink", "ros2:/tumortrack"),
         ("sink", "recording:{folder}/{number}"),
         ("tool", "ros2:tip?contact=/touch"),
+        ("tool", "openigtlink:{port}"),
         ("tool", "openigtlink:127.0.0.1:1"),
         ("tool", "ur:{arm}"),
         ("poses", "ros2:base_link"),
@@ -102,9 +104,12 @@ def again_and_again(once: Callable[[], None]) -> None:
 )
 def test_what_opens_closes_whole(kind, spec, pair, arm, tmp_path):
     numbers = count()
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    fixed = {"pair": pair, "folder": tmp_path, "arm": arm.host, "port": port}
 
     def once() -> None:
-        words = {"pair": pair, "folder": tmp_path, "number": next(numbers), "arm": arm.host}
+        words = {**fixed, "number": next(numbers)}
         opener(kind, spec.format(**words))().close()  # type: ignore[attr-defined]
 
     again_and_again(once)
