@@ -126,7 +126,7 @@ def prepare(
         case = load_case(folder)
         model = case_model(case, progress=progress)
         if weakness := weakness_of(model.provenance):
-            case = _told_in_picture(case, weakness, model)
+            case = _warning_in_picture(case, weakness, model)
     return case
 
 
@@ -139,7 +139,7 @@ def _draw_case(case: Case, folder: Path, weakness: str = "") -> None:
     qc_picture(case.labels, case.ct, case.anatomy, folder / _QC, *about)
 
 
-def _told_in_picture(case: Case, weakness: str, model: Model) -> Case:
+def _warning_in_picture(case: Case, weakness: str, model: Model) -> Case:
     """The case in its folder's place, with the same files but for the picture, and the model."""
     from tumortrack.models.folder import save_model
 
