@@ -6,11 +6,14 @@ import socket
 import struct
 from contextlib import closing
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 import pytest
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from browser import Browser
 from clock import until
 from igtl_objects import hear_all
 from live_objects import STAMP_NS, empty_update, small_setting, small_update
@@ -55,15 +58,21 @@ def published(points_ct: np.ndarray, motion: Wave) -> np.ndarray:
     return transform_points(ROBOT.published_from_camera, motion.carry(points_ct))
 
 
-def told(sequence: int = 0, motion: Wave = NOW, advised: bool = True, **evidence) -> TrackingResult:
-    """A result with advice on ``POINTS_CT``, and with evidence of these names."""
+def told(
+    sequence: int = 0,
+    motion: Wave = NOW,
+    advised: bool = True,
+    points_ct: np.ndarray = POINTS_CT,
+    **evidence,
+) -> TrackingResult:
+    """A result with advice on three points, and with evidence of these names."""
     update = small_update(sequence, STAMP_NS + sequence * 1_000_000_000, ROBOT)
     advice = [
         {
             "kind": "touch", "part": "tumor_1", "place_mm": place.tolist(),
             "direction": (0.0, 0.0, -1.0), "std_mm": STD_MM[n], "then_std_mm": STD_MM[n + 1],
         }
-        for n, place in enumerate(motion.carry(POINTS_CT))
+        for n, place in enumerate(motion.carry(points_ct))
     ]  # fmt: skip
     advice.append({**advice[0], "kind": "look"})
     pieces = [
@@ -150,6 +159,51 @@ def test_the_viewer_shows_them_where_they_are_unless_they_are_switched_off():
         sink.publish(replace(empty_update(1), published_frame=ROBOT))
         assert not any(len(nodes(f"/estimate/{n}").points) for n in sink._scene._spots)
         assert not any(label.visible for label in labels)
+
+
+def label_boxes(browser: Browser) -> list[tuple[slice, ...]]:
+    """Rows and columns of each label's box: light, and larger than any observed point."""
+    light = (browser.picture() > 190).all(axis=2)
+    light[:110] = False  # the banner
+    pieces, _ = ndimage.label(light)
+    found = ndimage.find_objects(pieces)
+    return [box for box in found if box[0].stop - box[0].start > 12 and width_of(box) > 40]
+
+
+def width_of(box: tuple[slice, ...]) -> int:
+    return int(box[1].stop - box[1].start)
+
+
+def apart_and_whole(boxes: list[tuple[slice, ...]], width: int) -> bool:
+    """Three of equal width, as their words are equally long, within the page."""
+    widths = [width_of(box) for box in boxes]
+    return (
+        len(boxes) == 3
+        and max(widths) - min(widths) <= 3
+        and max(box[1].stop for box in boxes) < width
+        and all(
+            any(a.stop <= b.start or b.stop <= a.start for a, b in zip(one, other, strict=True))
+            for one, other in combinations(boxes, 2)
+        )
+    )
+
+
+@pytest.mark.slow
+def test_on_a_phone_labels_of_places_near_each_other_neither_overlap_nor_are_cut_off(monkeypatch):
+    monkeypatch.setattr("tumortrack_devices.sinks.viewer._STALE_S", 60.0)  # of a busy machine
+    near = np.array([[0.0, 0.0, 0.0], [3.0, -5.0, 0.0], [24.0, -2.0, 0.0]])
+    aim = NOW.back(np.array([[0.0, 0.0, 104.0]]))
+    update = told(points_ct=NOW.back(near + NOW.carry(aim)))
+    update = replace(update, organ=None, observation=None)
+    sink = ViewerSinkConfig(port=0, hz=60).open(replace(small_setting(), published_frame=ROBOT))
+    with closing(sink), Browser(390, 844) as browser:
+        browser.open(sink.url)
+
+        def shown() -> bool:
+            sink.publish(update)
+            return "GOOD" in browser.text() and apart_and_whole(label_boxes(browser), 390)
+
+        until(shown, "three whole labels apart")
 
 
 def test_a_place_behind_a_tumor_has_no_label():

@@ -83,10 +83,11 @@ def test_what_can_be_no_pair_is_refused(text, words):
         SOURCES.parse(text)
 
 
-def test_what_is_not_there_is_said(folder):
+def test_what_is_not_there_is_said_by_us_alone(folder, capfd):
     with pytest.raises(InputError, match="nowhere"):
         SOURCES.parse(spec(folder, left="nowhere.avi")).open()
     with pytest.raises(SourceLost, match="/dev/video97"):
         SOURCES.parse(f"stereo:97,98?calibration={folder / 'stereo.json'}").open()
     with pytest.raises(InputError, match=r"stereo\.json"):
         SOURCES.parse("stereo:97,98?calibration=/nowhere/stereo.json").open()
+    assert capfd.readouterr() == ("", "")

@@ -208,12 +208,14 @@ def test_banner_and_panel_leave_room_for_each_other_at_every_size():
         feed = Feed(sink, shown)
         try:
             browser.open(sink.url)
-            for width, height in ((390, 844), (1440, 900), (3840, 2160)):
+            for width, height, panel in (
+                (390, 844, 390), (1440, 900, 360), (2560, 1440, 540), (3840, 2160, 720),
+            ):  # fmt: skip
                 browser.resize(width, height)
                 heights = set()
                 for word, feed.update in states.items():
                     until(partial(says, browser, word, "tumor 1"), f"{word} at {width}")
-                    check_room(browser, width, height)
+                    check_room(browser, width, height, panel)
                     heights.add(round(browser.box("#tumortrack-numbers")[3]))
                 assert len(heights) == 1
                 assert LONGEST in browser.text()
@@ -227,7 +229,7 @@ def says(browser: Browser, *words: str) -> bool:
     return all(word in text for word in words)
 
 
-def check_room(browser: Browser, width: int, height: int) -> None:
+def check_room(browser: Browser, width: int, height: int, panel_width: int) -> None:
     left, top, wide, high = browser.box(".tumortrack-over > div")
     foot = top + high
     assert min(left, top, width - left - wide, height - foot) >= 0
@@ -241,6 +243,7 @@ def check_room(browser: Browser, width: int, height: int) -> None:
     else:
         assert left + wide <= at
     assert at + its_width <= width
+    assert its_width == pytest.approx(panel_width, rel=0.15)  # numbers have a border round them
 
 
 GIVEN = ("PICTURES", "DEMO", "PLAN")

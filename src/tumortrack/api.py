@@ -8,6 +8,7 @@ everywhere; the CT frame is LPS, the camera frame x right, y down, z forward. Al
 from __future__ import annotations
 
 import logging
+import shutil
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
     from tumortrack.tracking.tracker import Tracker
 
 StrPath = str | Path
+_QC = "qc.png"
 
 
 def scan_phantom(
@@ -100,6 +102,7 @@ def prepare(
     from tumortrack.imaging import prepare as preparing
     from tumortrack.imaging.case import KIND, save_case
     from tumortrack.imaging.options import PrepareOptions
+    from tumortrack.models.folder import weakness_of
     from tumortrack.tracking.model_files import case_model
 
     asked = options_from(PrepareOptions, options, "prepare")
@@ -117,18 +120,45 @@ def prepare(
         keep = Path(folder).with_name(f"{Path(folder).name}.labels.nii.gz")
         case = segmented_case(sources[0], segment, asked, keep)
     if folder is not None:
-        from tumortrack.report.pictures import qc_picture
-
         with store.new_folder(Path(folder), overwrite) as aside:
-            doubts = [weakness.words for weakness in case.warnings]
-            if doubtful := case.report["half_turn"]["warning"]:
-                doubts.append(doubtful)
-            about = str(case.patient), doubts
-            qc_picture(case.labels, case.ct, case.anatomy, aside / "qc.png", *about)
+            _draw_case(case, aside)
             save_case(case, aside)
         case = load_case(folder)
-        case_model(case, progress=progress)
+        model = case_model(case, progress=progress)
+        if weakness := weakness_of(model.provenance):
+            case = _warning_in_picture(case, weakness, model)
     return case
+
+
+def _draw_case(case: Case, folder: Path, weakness: str = "") -> None:
+    """The picture that users check a case by. ``weakness``: of its model."""
+    from tumortrack.report.pictures import qc_picture
+
+    doubts = [
+        *(found.words for found in case.warnings),
+        case.report["half_turn"]["warning"],
+        weakness,
+    ]
+    about = str(case.patient), [*filter(None, doubts)]
+    qc_picture(case.labels, case.ct, case.anatomy, folder / _QC, *about)
+
+
+def _warning_in_picture(case: Case, weakness: str, model: Model) -> Case:
+    """The case in its folder's place, with the same files but for the picture, and the model."""
+    from tumortrack.models.folder import save_model
+
+    assert case.folder is not None
+    manifest = store.read_json(case.folder / store.MANIFEST)
+    with store.new_folder(case.folder, True) as aside:
+        for name in manifest["files"]:
+            shutil.copy2(case.folder / name, aside)
+        _draw_case(case, aside, weakness)
+        manifest["files"][_QC] = store.sha256_of(aside / _QC)
+        store.write_json(aside / store.MANIFEST, manifest)
+        about = {**model.provenance, "case_sha256": store.sha256_of(aside / store.MANIFEST)}
+        (aside / case.MODEL).mkdir()
+        save_model(replace(model, provenance=about), aside / case.MODEL)
+    return load_case(case.folder)
 
 
 def simulate_scenes(

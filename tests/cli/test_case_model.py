@@ -19,6 +19,7 @@ from tumortrack.models.folder import read_model_manifest, weakness_of
 from tumortrack.report.inspection import describe
 from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.tracking import model_files
+from warp_objects import slim_clinic
 
 MAKING = "making the case's model, once"
 LAYS = "it lays the organ of the CT on the points"
@@ -220,3 +221,37 @@ def test_prepare_says_that_a_ball_does_not_show_how_it_lies(tmp_path):
     weakness = weakness_of(read_model_manifest(tmp_path / "case" / "model")["provenance"])
     assert weakness
     assert f"note: {weakness}" in succeeded(said).splitlines()
+
+
+def seeing(written: list, make_model):
+    """``make_model``, which notes the files that its case has."""
+
+    def seen(case, *given, **options):
+        written.append(store.read_json(case.folder / store.MANIFEST)["files"])
+        return make_model(case, *given, **options)
+
+    return seen
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("weakness", ["", "every third scene was 9 mm off"])
+def test_the_picture_of_a_case_tells_how_weak_its_model_is(
+    weakness, phantom_case, tmp_path, monkeypatch
+):
+    drawn, written = [], list[dict[str, str]]()
+    monkeypatch.setattr(
+        "tumortrack.report.pictures.qc_picture",
+        lambda *given: [given[3].write_text(str(given[5])), drawn.append(given[5])],
+    )
+    monkeypatch.setattr(model_files, "make_model", seeing(written, model_files.make_model))
+    monkeypatch.setattr("tumortrack.models.folder.weakness_of", lambda about: weakness)
+    monkeypatch.setattr(model_files, "clinic", lambda *_: slim_clinic())
+    made = api.prepare(phantom_case / "labels.nii.gz", tmp_path / "case")
+    before, *after = drawn
+    assert after == ([[*before, weakness]] if weakness else [])
+    assert made.sha256 == store.sha256_of(tmp_path / "case" / store.MANIFEST)
+    assert model_files.is_model_of(tmp_path / "case" / "model", tmp_path / "case")
+    store.read_manifest(tmp_path / "case" / "model", "model")  # whole
+    files = store.read_manifest(tmp_path / "case", "case")["files"]
+    assert {n for n in files if files[n] != written[0][n]} == ({"qc.png"} if weakness else set())
+    assert ended(tmp_path) == ["case"]

@@ -21,7 +21,7 @@ from tumortrack.sense.ply import write_cloud_ply
 
 PAGES = sorted((Path(__file__).parents[2] / "docs" / "how-to").glob("*.md"))
 LEFT = {  # what a page's commands leave behind, besides what they print
-    "camera": ("RUN/metadata.yaml", "again.json"),
+    "camera": ("RUN/metadata.yaml", "again.json", "PACKED/metadata.yaml"),
     "ct": ("CASE/qc.png", "RUN/tumor_2.ply", "RUN_WITH_POINTS/points.csv"),
     "evaluate": ("REPORT/index.html",),
     "evidence": ("RUN/report.json", "TOUCHED/tumor_1.ply"),

@@ -95,7 +95,7 @@ def test_the_exit_status_is_the_commands_where_nobody_reads_on(status):
 
 def test_a_broken_command_of_another_package_stops_no_other(monkeypatch, tmp_path, capsys):
     broken = EntryPoint("broken", "nowhere.at_all:Command", "tumortrack.commands")
-    monkeypatch.setattr(main, "entry_points", lambda group: (broken,))
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: (broken,))
     assert main.run(["inspect", str(tmp_path)]) == 2
     assert "nothing that inspect knows" in capsys.readouterr().err
     assert main.run(["broken"]) == 2

@@ -1,7 +1,9 @@
 """Artifact folders and mesh files: whole or absent, and damage is found."""
 
 import json
+import os
 import shutil
+import signal
 import subprocess
 import sys
 import textwrap
@@ -335,3 +337,11 @@ def test_what_killed_processes_left_is_cleared_and_what_another_writes_is_not(tm
             pass
         shutil.rmtree(tmp_path / "more")
     assert {path.name for path in tmp_path.iterdir()} == {"run", "more"}
+
+
+def test_an_interrupted_write_leaves_the_old_file_alone(tmp_path, monkeypatch):
+    store.write_atomically(tmp_path / "file", b"old")
+    monkeypatch.setattr(os, "fsync", lambda _: signal.raise_signal(signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):
+        store.write_atomically(tmp_path / "file", b"new")
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"]

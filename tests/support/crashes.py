@@ -25,8 +25,13 @@ import numpy as np
 
 from clock import PATIENCE_S, until
 from harness import Child, Ending, Work, base_in, command, new_command
+from tumortrack.core.errors import TumortrackError
+from tumortrack.core.store import read_json, read_manifest
 
 _LONG_S = 12.0  # within which commands are interrupted
+_STOPPING_S = 60.0  # after which a command that does not stop is killed, and so seen
+_FINISHING_S = 10.0  # within which a command may end as if it had not been interrupted
+_NOISE = ("Traceback", "Exception ignored", "Fatal Python error", "terminate called", "Warning: ")
 _SOME_FRAMES = 6 * 2**20  # bytes, of which one frame has 2 MB at most: then its pauses are known
 _LOST_S = 1.0  # of a recording, and the longest pause between two of its frames: on a busy machine
 Words = tuple[object, ...]  # of a command
@@ -111,8 +116,6 @@ def training(place: Place) -> str:
 
 def making(place: Place) -> str:
     """The first command that needs a case's model, killed while it makes it"""
-    from tumortrack.core.store import read_manifest
-
     case = place.folder / "case"
     shutil.copytree(place.base / "case", case, ignore=shutil.ignore_patterns("model"))
     files = names_in(case) | {"model"}
@@ -131,8 +134,6 @@ def making(place: Place) -> str:
 
 def locating(place: Place) -> str:
     """`locate` onto an older run, killed"""
-    from tumortrack.core.store import read_manifest
-
     run = place.folder / "run"
     words = (*place.locate(run), "--overwrite")
     takes_s = whole(words)
@@ -189,12 +190,11 @@ def stamps_of(tape: Path) -> list[int]:
 # Interrupted ----------------------------------------------------------------------------------
 
 
-def interrupting(place: Place) -> str:
-    """Every long command, interrupted (Ctrl-C) at a random moment"""
+def long_commands(place: Place) -> tuple[Words, ...]:
     case, out, scenes = place.base / "case", place.folder / "out", place.base / "scenes"
     world = f"virtual:{case}?breathing=false&instrument=false&camera_motion=false&fps=10"
     budget = ("--accept-poor", "--accept-budget")
-    commands: tuple[Words, ...] = (
+    return (
         ("prepare", case / "labels.nii.gz", out),
         ("simulate", case, out, "--scenes", 8),
         ("train", case, out),
@@ -209,25 +209,59 @@ def interrupting(place: Place) -> str:
         ("phantom-kit", case, out),
         ("twin", case, out),
     )
-    counts = dict[int, int]()
-    for words in commands:
+
+
+def interrupting(place: Place) -> str:
+    """Every long command, interrupted (Ctrl-C) at a random moment"""
+    outcomes, faults = dict[str, dict[str, int]](), list[str]()
+    for words in long_commands(place):
+        name = f"{words[0]} {str(words[2]).strip('-')}" if words[0] == "resect" else str(words[0])
+        mine = outcomes.setdefault(name, {})
         for _ in range(place.times):
             after_s = place.rng.uniform(0.05, _LONG_S)
             child = Child(new_command(*words), place.folder)
             time.sleep(after_s)
+            running = child.running()
             child.interrupt()
-            ending = child.end(60.0)
-            said = f"{words[0]} after {after_s:.2f} s: exit {ending.code}: {ending.output[-600:]}"
-            # A Python that is ending, or has hardly begun, ends by the signal: 130 to a shell.
-            code = 130 if ending.code == -signal.SIGINT else ending.code
-            require(code in (0, 4, 130) and "Traceback" not in ending.output, said)
-            counts[code] = counts.get(code, 0) + 1
-            strays = names_in(place.folder) - {"out", "out.gif", "runs"}
-            require(not strays, f"{said}; left behind: {strays}")
+            ending = child.end(after_s + _STOPPING_S)
+            what, wrong = _interrupted(ending, running, place.folder)
+            if ending.code == 0 and ending.seconds > after_s + _FINISHING_S and name != "track":
+                wrong += "not stopped"
+            mine[what] = mine.get(what, 0) + 1
+            said = f"{name} after {after_s:.2f} s: exit {ending.code}: {ending.output[-600:]}"
+            faults += [f"{wrong}: {said}"] if wrong else []
             shutil.rmtree(place.folder)
             place.folder.mkdir()
-    stopped = counts.pop(130, 0)
-    return f"{stopped} ended with 130 and no traceback; {sum(counts.values())} had ended before"
+    counts = "; ".join(
+        f"{name}: " + ", ".join(f"{count} {what}" for what, count in sorted(mine.items()))
+        for name, mine in outcomes.items()
+    )
+    return require(not faults, " / ".join([*faults, counts])) and counts
+
+
+def _interrupted(ending: Ending, running: bool, folder: Path) -> tuple[str, str]:
+    """How a command ended after Ctrl-C, and what is wrong with that, if anything."""
+    wrong = [noise for noise in _NOISE if noise in ending.output]
+    if ending.code not in (0, 4, 130, -signal.SIGINT):
+        wrong.append(f"exit {ending.code}")
+    if ending.code == 130 and ending.refusals != [ending.line]:
+        wrong.append(f"{len(ending.refusals)} lines, or not the last")
+    strays = names_in(folder) - {"out", "out.gif", "runs"}
+    strays |= {str(path.relative_to(folder)) for path in folder.rglob(".*")}
+    if strays:
+        wrong.append(f"left behind: {strays}")
+    for manifest in folder.rglob("manifest.json"):
+        try:
+            read_manifest(manifest.parent, read_json(manifest)["kind"])
+        except TumortrackError as error:
+            wrong.append(str(error))
+    if (
+        ending.code == -signal.SIGINT
+    ):  # a Python that has hardly begun, or is ending: 130 to a shell
+        return "by the signal", "; ".join(wrong)
+    if not running:
+        return "had ended", "; ".join(wrong)
+    return f"with {ending.code}", "; ".join(wrong)
 
 
 # Short of something ---------------------------------------------------------------------------

@@ -110,6 +110,8 @@ def _become(work: Work, folder: Path, limits: Mapping[int, int], output: int) ->
         os.chdir(folder)
         os.dup2(output, 1)
         os.dup2(output, 2)
+        # What a shell starts in the background ignores Ctrl-C, and so would all that it starts.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         for kind, limit in {resource.RLIMIT_CORE: 0, **limits}.items():
             resource.setrlimit(kind, (limit, limit))
         code = work()

@@ -9,14 +9,12 @@ import signal
 import sys
 from collections.abc import Callable
 from importlib import import_module
-from importlib.metadata import entry_points
 from typing import NoReturn, Protocol, runtime_checkable
-
-import tyro
 
 import tumortrack
 from tumortrack.core.errors import EXIT_STATUSES, InputError, PackageError, TumortrackError
 from tumortrack.core.packages import to_install
+from tumortrack.core.process import interrupt_between_imports
 
 
 @runtime_checkable
@@ -55,6 +53,7 @@ def main() -> None:
     # PyTorch and the like create hundreds of thousands of objects that live to the end. Searching
     # them for garbage takes a tenth of their import's time.
     gc.set_threshold(_OBJECTS_PER_COLLECTION)
+    interrupt_between_imports()
     code = run(sys.argv[1:])
     if code == _STOPPED:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C changes nothing
@@ -116,6 +115,8 @@ def _commands(chosen: str) -> dict[str, Callable[..., Command]]:
     (entry points ``tumortrack.commands``)."""
     if chosen in _MODULES:
         return {chosen: _ours(chosen)}
+    from importlib.metadata import entry_points
+
     others = sorted(entry_points(group="tumortrack.commands"), key=lambda point: point.name)
     others = [point for point in others if point.name == chosen] or others
     commands = {name: _ours(name) for name in _MODULES}
@@ -139,6 +140,8 @@ def _ours(name: str) -> Callable[..., Command]:
 
 def _parse(arguments: list[str]) -> Command:
     """Builds only the chosen command's options: all of them take several times as long."""
+    import tyro  # in here, Ctrl-C ends in one line
+
     commands = _commands(arguments[0] if arguments else "")
     if arguments and arguments[0] in (*commands, *_DISTRIBUTIONS):
         named = (tyro.conf.PositionalMetavarFromFieldName,)  # MODEL CLOUD OUT, not PATH PATH PATH

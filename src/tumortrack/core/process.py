@@ -9,15 +9,20 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import TypeVar
+from types import FrameType
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from concurrent.futures import ThreadPoolExecutor
 
 _CGROUPS = Path("/sys/fs/cgroup")
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_MMAP_MAX = -1, -3, -4  # glibc's malloc.h
 _MMAP_MAX = 65536  # glibc's default
+_RETRY_S = 0.02  # after which an import may have ended
+_CATCHING_ALL = {"trimesh"}  # when they import others
 _SMALL = 32 * 2**20  # bytes: the largest threshold that glibc accepts
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -79,6 +84,8 @@ def parallel_map(call: Callable[[_Item], _Result], items: Sequence[_Item]) -> li
 @cache
 def _helper(process: int) -> ThreadPoolExecutor | None:
     """A second thread of this process (threads do not survive a fork), if there is a core."""
+    from concurrent.futures import ThreadPoolExecutor
+
     cores = min(available_cores(), int(os.environ.get("NUMBA_NUM_THREADS", "2")))
     return ThreadPoolExecutor(1, "parallel") if cores > 1 else None
 
@@ -99,6 +106,38 @@ def undisturbed() -> Iterator[None]:
         signal.signal(signal.SIGINT, handler)
         if came:
             signal.raise_signal(signal.SIGINT)
+
+
+def interrupt_between_imports(retries: int = 100) -> None:
+    """Let Ctrl-C wait while modules are imported: some libraries catch all that is raised in there,
+    and go on as if nothing had been, or with half of themselves. After ``retries``, 2 s, it waits
+    for those alone that are known to do so."""
+    if sys.platform == "win32" or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        return  # no timer; or a shell in the background wants it to be ignored
+
+    def came(number: int, frame: FrameType | None) -> None:
+        nonlocal retries
+        packages = _importing(frame)
+        if packages & _CATCHING_ALL or (packages and retries > 0):
+            retries -= 1
+            signal.setitimer(signal.ITIMER_REAL, _RETRY_S)
+            return
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
+    signal.signal(signal.SIGINT, came)
+
+
+def _importing(frame: FrameType | None) -> set[str]:
+    """The packages of which a module is being imported in a frame or its callers."""
+    packages, module = set[str](), ""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib."):
+            packages.add(module.partition(".")[0])
+        elif frame.f_code.co_name == "<module>":
+            module = str(frame.f_globals.get("__name__"))
+        frame = frame.f_back
+    return packages
 
 
 def keep_freed_memory() -> None:

@@ -93,6 +93,9 @@ def write_atomically(path: Path, content: bytes) -> None:
         raise StorageError(
             f"cannot write {path}: {error.strerror}. Free some space or choose another place."
         ) from error
+    except BaseException:  # Ctrl-C
+        aside.unlink(missing_ok=True)
+        raise
 
 
 def write_json(path: Path, data: object) -> None:

@@ -88,6 +88,8 @@ class Link:
         """Give receivers up to a second to take what waits for them; may be called twice."""
         self._call(self._closing.set)
         self._thread.join()
+        if self._listener is not None:  # the thread may have ended before it listened
+            self._listener.close()
 
     def _call(self, function: Callable[..., object], *arguments: object) -> None:
         with contextlib.suppress(RuntimeError):  # closed

@@ -42,8 +42,16 @@ class McapBag:
     StorageError, which ends with ``advice``.
     """
 
-    def __init__(self, folder: Path, messages: Messages, advice: str) -> None:
-        from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+    def __init__(
+        self, folder: Path, messages: Messages, advice: str, compressed: bool = False
+    ) -> None:
+        from rosbags.rosbag2 import (
+            CompressionFormat,
+            CompressionMode,
+            StoragePlugin,
+            Writer,
+            WriterError,
+        )
 
         self._messages, self._advice = messages, advice
         self._connections: dict[str, Any] = {}
@@ -52,6 +60,8 @@ class McapBag:
         try:
             # Version 8 is Humble's.
             writer: Any = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)
+            if compressed:  # each chunk, as ROS 2 does it too
+                writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
             writer.open()
         except WriterError as error:
             raise InputError(f"{folder} exists already. Choose another path.") from error

@@ -36,13 +36,15 @@ _ON_FULL_DISK = (
 
 class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"):
     """A new folder with every result and observation: depth images as 32FC1 in metres (float32 to
-    1e-5 mm), stamps exact. ``meshes_hz``: limit for surfaces; 0: with every result."""
+    1e-5 mm), stamps exact. ``meshes_hz``: limit for surfaces; 0: with every result. ``compressed``:
+    without loss (zstd), to about a third; that takes a good part of a core from the tracker."""
 
     target: ClassVar[str] = "path"
     queue_size: ClassVar[int] = 30
 
     path: Path
     meshes_hz: float = 2.0
+    compressed: bool = False
 
     def __post_init__(self) -> None:
         self.check_between("recording:", meshes_hz=(0, 1000))
@@ -53,7 +55,7 @@ class RecordingSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="recording"
     def open(self, context: SinkContext) -> RecordingSink:
         with writing(self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            sink = RecordingSink(self.path, context, self.meshes_hz)
+            sink = RecordingSink(self, context)
         frame = context.published_frame
         about = {
             "kind": "recording",
@@ -78,10 +80,10 @@ class RecordingSink:
     with the frame; ``/tumortrack/...`` the results as in ROS, and ``report`` (JSON); ``/tf`` where
     the frames differ. For a moving camera also a table of its poses for `track --moving`."""
 
-    def __init__(self, folder: Path, context: SinkContext, meshes_hz: float) -> None:
-        self._messages = Messages()
-        self._results = ResultMessages(self._messages, context, meshes_hz, observed=False)
-        self._bag = McapBag(folder, self._messages, _ON_FULL_DISK)
+    def __init__(self, config: RecordingSinkConfig, context: SinkContext) -> None:
+        folder, self._messages = config.path, Messages()
+        self._results = ResultMessages(self._messages, context, config.meshes_hz, observed=False)
+        self._bag = McapBag(folder, self._messages, _ON_FULL_DISK, config.compressed)
         self._poses: io.FileIO | None = None
         if context.published_frame.moves:
             self._poses = io.FileIO(folder / POSES, "a")

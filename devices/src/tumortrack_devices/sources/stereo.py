@@ -6,9 +6,13 @@ cameras must be synchronised, as an endoscope's are.
 
 from __future__ import annotations
 
+import os
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -99,7 +103,8 @@ class StereoSource:
 
     def _opened(self, name: str) -> Any:
         cv2, device, camera = self._cv2, name.isdecimal(), self._rig.intrinsics
-        capture = cv2.VideoCapture(int(name) if device else name)
+        with _quiet(cv2):
+            capture = cv2.VideoCapture(int(name) if device else name)
         if device:
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, camera.width)
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, camera.height)
@@ -132,3 +137,15 @@ class StereoSource:
                 self._room.notify_all()
         for camera in self._cameras:
             camera.release()
+
+
+@contextmanager
+def _quiet(cv2: ModuleType) -> Iterator[None]:
+    """Without the lines of OpenCV and FFmpeg, whose matter is said in one of ours."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when the first file is opened
+    logging = cv2.utils.logging
+    before = logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    try:
+        yield
+    finally:
+        logging.setLogLevel(before)
