@@ -3,9 +3,11 @@ each view, and all views fitted as one."""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -19,10 +21,12 @@ from tumortrack.core.types import Look, SensorCloud
 from tumortrack.live.frames import FrameCheck
 from tumortrack.live.tools import Tools
 from tumortrack.live.values import CameraView, PublishedFrame, SinkContext
+from tumortrack.sense.measured_noise import DepthNoise
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.sense.region.tissue import TissueClassifier
 from tumortrack.tracking.tracker import Follower, Tracker
 
+_NOISE_S = 1.0  # a camera's noise is measured so often: as long as a frame's other work takes
 _PICK_S = 3.0  # without the organ: a pick is forgotten
 
 SCAN_LOOKS, SCAN_WITHIN_S = 3, 5.0
@@ -57,6 +61,7 @@ class ViewsLocator:
         # Of the first camera by its calibration, of others as they come.
         self.frames = FrameCheck(context.published_frame, region, frozen_s)
         self._frames = {1: self.frames}
+        self._noises: dict[int, tuple[float, DepthNoise]] = {}  # of each camera, and when
         self.tools = Tools({}, context, self.frames.notes)
         self.evidence: tuple[Evidence, ...] = ()  # that the present frame brought
 
@@ -114,7 +119,13 @@ class ViewsLocator:
             doubt = frames.check(seen)
         with timed(seconds, "organ"):
             rng = np.random.default_rng((self._seed, seen.stamp_ns))
-            organ = organ_points(seen.content, self._region, self._hints(view), rng)
+            measured_s, noise = self._noises.get(view.number, (-math.inf, None))
+            if time.monotonic() - measured_s > _NOISE_S:
+                noise = None
+            hints = replace(self._hints(view), noise=noise)
+            organ = organ_points(seen.content, self._region, hints, rng)
+            if noise is None and organ.noise is not None:
+                self._noises[view.number] = time.monotonic(), organ.noise
         frames.check_new(seen.content)  # that it shows nothing would be said before
         return organ.cloud, "; ".join(filter(None, (doubt, organ.doubt)))
 

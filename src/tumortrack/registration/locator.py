@@ -249,6 +249,8 @@ class RegistrationLocator:
             looks = replace(looks, evidence=EvidenceTerms.of(pieces, self._touchable))
             fits = [fit.beside(looks.evidence) for fit in fits]
         fit, usual = likeliest(fits, method.prior), self._calibration.usual_cost * looks.count
+        if looks.count == 1:
+            fit = method.with_all_points(fit, looks, rounds=1)
         usual += looks.noise_cost(method.config)
         doubtful = fit.points_cost > usual or apart_mm(fit.motion, start) > _JUMP_MM
         # From one frame to the next nobody turns an organ over.
