@@ -150,7 +150,7 @@ HEAD = "stamp_ns,frame_id,x_mm,y_mm,z_mm,qw,qx,qy,qz\n"
     ("text", "said"),
     [
         ("", "has no rows"),
-        ("stamp,x\n1,2\n", "is not a table of poses"),
+        ("stamp,x\n1,2\n", "column 'stamp'"),
         (HEAD, "has no rows"),
         (HEAD + "5,base,0,0,0,1,0,0,0\n5,base,0,0,0,1,0,0,0\n", "stamps must rise"),
         (HEAD + "5,base,0,0,0,1,1,0,0\n", "qw, qx, qy, qz must have length 1"),

@@ -434,7 +434,7 @@ def test_estimates_are_published_in_the_robots_frame():
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ({"unit": "mm"}, "none of them"),
+        ({"unit": "mm"}, "camera_from_robot"),
         ({"unit": "inch", "camera_from_robot": np.eye(4).tolist()}, "unit"),
         ({"unit": "mm", "camera_from_robot": np.diag([1, 1, -1, 1.0]).tolist()}, "right-handed"),
         ({"unit": "mm", "camera_from_robot": (2 * np.eye(4)).tolist()}, "orthonormal"),

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Bool, Float, Float64, Int64
 
 from tumortrack.core.geometry import Affine, Points, rigid, transform_points
 from tumortrack.core.report import LooksReport
@@ -128,10 +128,7 @@ class Looks:
         """With those candidates that lie near the organ's surface where it faces the camera."""
         if self.candidates_mm is None or not len(self.candidates_mm):
             return self
-        rows = motion.residual_rows(self.candidates_mm)
-        towards = (rows[:, :3] * (self.candidates_mm @ motion.rotation)).sum(1)
-        facing = towards > _FACING * np.linalg.norm(self.candidates_mm, axis=1)
-        on = self.candidates_mm[facing & (np.abs(rows[:, -1]) < within_mm)]
+        on = self.candidates_mm[lies_on(motion, self.candidates_mm, within_mm)]
         numbers = np.append(self.look, np.zeros(len(on), int))
         return replace(self, points_mm=np.concatenate([self.points_mm, on]), look=numbers)
 
@@ -141,18 +138,13 @@ class Looks:
         model_mm2 = config.sigma_mm**2 / min(config.n_effective, points)
         return 1 / (points * (model_mm2 + self.noise.mean_mm**2))
 
-    @property
-    def more_noise_mm(self) -> float:
-        """Of a point, beyond what ``GaussNewtonConfig.sigma_mm`` contains."""
-        return float(np.sqrt(max(self.noise.point_mm**2 - _CONTAINED_MM**2, 0.0)))
-
     def width_mm(self, config: GaussNewtonConfig) -> float:
-        """Of the robust kernel in the last steps: so wide that noise makes no outliers."""
-        return float(np.hypot(config.last_mm, _WIDTHS * self.more_noise_mm))
+        """Of the robust kernel in the last steps."""
+        return kernel_width_mm(config, self.noise)
 
     def noise_cost(self, config: GaussNewtonConfig) -> float:
         """What the points' noise adds to the cost of a right fit."""
-        squares = (_ACROSS * self.more_noise_mm * _NODES) ** 2
+        squares = (_ACROSS * _more_mm(self.noise) * _NODES) ** 2
         robust_mm2 = squares / (1 + squares / self.width_mm(config) ** 2)
         return float(len(self.points_mm) * self.weight(config) * (_SHARES @ robust_mm2))
 
@@ -184,6 +176,26 @@ class Looks:
             points_mm[mine], poses[n] = _moved(back, points_mm[mine]), back @ poses[n]
         shifts = self.shifts + np.concatenate([np.zeros((1, POSE)), changes])
         return replace(self, points_mm=points_mm, camera_from_look=tuple(poses), shifts=shifts)
+
+
+def kernel_width_mm(config: GaussNewtonConfig, noise: PointNoise) -> float:
+    """Of the robust kernel in the last steps: so wide that noise makes no outliers."""
+    return float(np.hypot(config.last_mm, _WIDTHS * _more_mm(noise)))
+
+
+def _more_mm(noise: PointNoise) -> float:
+    """Of a point, beyond what ``GaussNewtonConfig.sigma_mm`` contains."""
+    return float(np.sqrt(max(noise.point_mm**2 - _CONTAINED_MM**2, 0.0)))
+
+
+def lies_on(
+    motion: ElasticMotion, points_mm: Float[np.ndarray, "n 3"], within_mm: float
+) -> Bool[np.ndarray, " n"]:
+    """Which points lie near the organ's surface where it faces the camera."""
+    rows = motion.residual_rows(points_mm)
+    towards = (rows[:, :3] * (points_mm @ motion.rotation)).sum(1)
+    facing = towards > _FACING * np.linalg.norm(points_mm, axis=1)
+    return np.asarray(facing & (np.abs(rows[:, -1]) < within_mm))
 
 
 def _moved(pose: Affine, points: Points) -> Points:

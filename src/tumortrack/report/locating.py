@@ -15,7 +15,15 @@ from tumortrack.core.evidence import read_evidence
 from tumortrack.report.seen import Seen
 from tumortrack.tracking.options import LocateOptions, check_grid, model_folder
 from tumortrack.tracking.points import PointTable, check_near_organ, read_points
-from tumortrack.tracking.views import NO_CLOUD, View, further_looks, read_places, read_views
+from tumortrack.tracking.views import (
+    NO_CLOUD,
+    OrganInView,
+    View,
+    as_fitted,
+    further_looks,
+    read_places,
+    read_views,
+)
 
 if TYPE_CHECKING:
     from tumortrack.core.estimate import Estimate
@@ -94,21 +102,22 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
         "model_sha256": store.sha256_of(folder / store.MANIFEST),
         "cloud_sha256": None if clouds[0] == NO_CLOUD else store.sha256_of(clouds[0]),
     }
-    ct, organs = _ct(options.case, model, tracker.anatomy_ct), []
-    seen = Seen(content=views[0].content, ct=ct)
+    seen = Seen(content=views[0].content, ct=_ct(options.case, model, tracker.anatomy_ct))
+    found: list[OrganInView] = []
     try:
-        for view in views:
-            organ, entry, taken = view.organ(model, options, hints)
-            organs.append(organ)
-            about["input"].append(entry)
-            if view is views[0]:
-                seen = replace(seen, cloud=organ, taken=taken)
+        found.extend(view.organ(model, options, hints) for view in views)
+        organs = [organ.cloud for organ in found]
         looks = further_looks(organs, views, fixed_from_camera)
         known = views[0].content, (*looks, *evidence)
         estimate = tracker.locate(organs[0], options.grid, options.seed, *known)
     except NoEstimate as error:
+        about["input"] = [organ.entry for organ in found]
         about = {**_no_estimate(error, views[0], model, options), **about}
+        seen = replace(seen, cloud=found[0].cloud, taken=found[0].taken) if found else seen
         return Located(None, about, seen, points, error)
+    found = as_fitted(views, found, estimate, model)
+    about["input"] = [organ.entry for organ in found]
+    seen = replace(seen, cloud=found[0].cloud, taken=found[0].taken)
     if estimate.quality == "poor" and views[0].unit is not None:
         doubt = f"if that is not the organ, or not all of it: {_ASK}; --whole takes all."
         about["notes"].append(doubt)

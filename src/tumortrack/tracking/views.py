@@ -5,16 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import Affine
 from tumortrack.core.store import read_json
-from tumortrack.core.types import DepthFrame, Look, SensorCloud
+from tumortrack.core.types import DepthFrame, Look, PointNoise, SensorCloud
 from tumortrack.models.model import Model
+from tumortrack.registration.gauss_newton import FARTHEST
+from tumortrack.registration.looks import kernel_width_mm, lies_on
+from tumortrack.registration.model import RegistrationModel
+from tumortrack.registration.motion import ElasticMotion, seen_from_first
 from tumortrack.sense.camera import deproject_pixels
 from tumortrack.sense.cloud import check_cloud, check_depth_unit, crop_cloud
 from tumortrack.sense.files import (
@@ -27,6 +32,7 @@ from tumortrack.sense.files import (
 )
 from tumortrack.sense.measured_noise import noise_of
 from tumortrack.sense.region import Hints, organ_points
+from tumortrack.sense.region.working_image import ORGAN, PIECES, STEPS, THIN, image_of_frame
 from tumortrack.tracking.options import LocateOptions
 
 NO_CLOUD = Path("-")
@@ -54,17 +60,14 @@ class View:
         inside = None if mask is None else read_mask(mask, (camera.width, camera.height))
         return Hints(inside, None if at is None else _picked_mm(self.content, *at))
 
-    def organ(
-        self, model: Model, options: LocateOptions, hints: Hints
-    ) -> tuple[SensorCloud, dict[str, Any], UInt8[np.ndarray, "h w"] | None]:
-        """The organ's points; an entry for the report on how they were chosen, with a sentence for
-        people as ``words``; and the class of each pixel (``sense.region.Region``). A cloud is taken
-        for the organ alone, unless a box is given.
+    def organ(self, model: Model, options: LocateOptions, hints: Hints) -> OrganInView:
+        """The organ as it was found before anything was fitted. A cloud is taken for the organ
+        alone, unless a box is given.
 
         Raises NoEstimate: nothing can be the organ; InputError: the depth's unit cannot be right.
         """
         if isinstance(self.content, SensorCloud) and options.box is None:
-            return *self._cropped(self.content, options.range), None
+            return OrganInView(*self._cropped(self.content, options.range))
         given = {
             "--box": options.box,
             f"--at {' '.join(map(str, options.at or ()))}": options.at,
@@ -82,15 +85,20 @@ class View:
             unit = "in metres" if unit_mm == 1000 else f"in steps of {unit_mm:g} mm"
             words += f"depth {unit} ({stated_by}); "
         found = organ_points(self.content, region, hints, np.random.default_rng(options.seed))
-        counts = {name: n for name, n in found.counts.items() if n}
-        returns = sum(n for name, n in counts.items() if name != "no return")
-        others = ", ".join(f"{name} {n}" for name, n in counts.items()
-                           if name not in ("organ", "no return"))  # fmt: skip
-        words += f"{counts['organ']} of {returns} pixels with a return were taken for the organ, "
-        words += f"by {hint}{f' (others: {others})' if others else ''}."
-        entry |= {"organ": counts["organ"], "of": returns, "pixels": counts}
-        entry |= _with_noise(self.content, words)
-        return found.cloud, entry, found.taken
+        noise = found.noise or noise_of(self.content)
+        entry |= {} if noise is None else {"noise": noise.entry}
+        last = "" if noise is None else f"; {noise.words}"
+        return OrganInView(found.cloud, entry, found.taken, (words, last)).with_pixels(found.taken)
+
+    def fitted(self, found: OrganInView, motion: ElasticMotion, within_mm: float) -> OrganInView:
+        """The organ in a depth image once it is fitted: other pieces that lie on it are its own."""
+        if found.taken is None or not isinstance(self.content, DepthFrame):
+            return found
+        beside = np.flatnonzero(np.isin(found.taken, (THIN, PIECES)))
+        points_mm = image_of_frame(self.content, None).points(beside)
+        taken = found.taken.copy()
+        taken.ravel()[beside[lies_on(motion, points_mm, within_mm)]] = ORGAN
+        return found.with_pixels(taken)
 
     def _cropped(
         self, cloud: SensorCloud, range_mm: tuple[float, float] | None
@@ -106,6 +114,29 @@ class View:
         words += f", by {hint}." if hint else ": a cloud is taken for the organ alone."
         entry = {"file": self.path.name, "hint": hint, "organ": kept, "of": count}
         return cloud, {**entry, **_with_noise(cloud, words)}
+
+
+class OrganInView(NamedTuple):
+    """The organ's points; an entry for the report on how they were chosen, with a sentence for
+    people as ``words``; and the class of each pixel (``sense.region.Region``). ``around``: how that
+    sentence begins and ends."""
+
+    cloud: SensorCloud
+    entry: dict[str, Any]
+    taken: UInt8[np.ndarray, "h w"] | None = None
+    around: tuple[str, str] = ("", "")
+
+    def with_pixels(self, taken: UInt8[np.ndarray, "h w"]) -> OrganInView:
+        numbers = np.bincount(taken.ravel(), minlength=len(STEPS)).tolist()
+        counts = {name: n for name, n in zip(STEPS, numbers, strict=True) if n}
+        returns = sum(n for name, n in counts.items() if name != "no return")
+        others = ", ".join(f"{name} {n}" for name, n in counts.items()
+                           if name not in ("organ", "no return"))  # fmt: skip
+        words = f"{counts['organ']} of {returns} pixels with a return were taken for the organ, by "
+        words += f"{self.entry['hint']}{f' (others: {others})' if others else ''}"
+        entry = {"organ": counts["organ"], "of": returns, "pixels": counts}
+        entry["words"] = f"{self.around[0]}{words}{self.around[1]}."
+        return self._replace(taken=taken, entry={**self.entry, **entry})
 
 
 def _with_noise(content: DepthFrame | SensorCloud, words: str) -> dict[str, Any]:
@@ -188,3 +219,20 @@ def _picked_mm(frame: DepthFrame, column: int, row: int) -> Float[np.ndarray, " 
     x, y = pixels[np.square(pixels - [column, row]).sum(1).argmin()]
     depth_mm = frame.depth_mm[y, [x]].astype(float)
     return deproject_pixels(np.array([y * camera.width + x]), depth_mm, camera)[0].astype(float)
+
+
+def as_fitted(
+    views: Sequence[View], found: Sequence[OrganInView], estimate: Estimate, model: Model
+) -> list[OrganInView]:
+    """The organ in each view, by an estimate in the frame of the first."""
+    motion, looks = estimate.motion, estimate.report.looks
+    if not isinstance(motion, ElasticMotion) or not isinstance(model, RegistrationModel):
+        return list(found)
+    refine = model.config.refine
+    ways = [np.eye(4)] if looks is None else [np.array(pose) for pose in looks.camera_from_look]
+    out = []
+    for view, organ, way in zip(views, found, ways, strict=True):
+        width_mm = kernel_width_mm(refine, organ.cloud.noise or PointNoise())
+        there = seen_from_first(motion, np.linalg.inv(way))
+        out.append(view.fitted(organ, there, FARTHEST * width_mm))
+    return out
