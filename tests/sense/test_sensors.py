@@ -7,8 +7,8 @@ from typing import get_args
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from test_measured_noise import seen
 
+from noise_objects import seen
 from stories import succeeded, tumortrack
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, Intrinsics

@@ -24,6 +24,7 @@ _MOST_WINDOWS = 400  # a hundredth of the noise is then known; 10 ms
 _FEWEST = 12
 _ROUGH = 4.0  # times the median variance: an edge, a fold, a window with an outlier
 _NEIGHBOURS, _SPARSE_MM = 40, 3.0
+_WIDER = 4.0  # times the noise: the radius within which neighbours lie
 _STEP_OFF, _LEAST_STEP_MM = 0.02, 1e-3  # of a step, and of one: rounding of stored numbers
 _MOST_POINTS, _MOST_MIDDLES = 5000, 200  # of a cloud: more are hardly more certain
 TERMS = 6  # of a quadratic
@@ -113,12 +114,19 @@ def cloud_noise(cloud: SensorCloud) -> DepthNoise | None:
     if len(cloud.points_mm) < 2 * _NEIGHBOURS:
         return None
     points, middles, apart_mm2 = _around(cloud)
-    near = np.argpartition(apart_mm2, _NEIGHBOURS, axis=1)[:, :_NEIGHBOURS]
-    _, left = local_quadratics(points[near] - middles[:, None])
-    variances = np.sum(left**2, axis=1) / (_NEIGHBOURS - TERMS)
-    smooth = variances <= _ROUGH * np.median(variances)
     apart_mm = float(np.sqrt(np.median(np.partition(apart_mm2, 1, axis=1)[:, 1])))
-    white_mm = float(np.sqrt(variances[smooth].mean()))
+    while True:
+        near = np.argpartition(apart_mm2, _NEIGHBOURS, axis=1)[:, :_NEIGHBOURS]
+        local = points[near] - middles[:, None]
+        _, left = local_quadratics(local)
+        variances = np.sum(left**2, axis=1) / (_NEIGHBOURS - TERMS)
+        smooth = variances <= _ROUGH * np.median(variances)
+        white_mm = float(np.sqrt(variances[smooth].mean()))
+        reach_mm = float(np.median(np.sqrt((local**2).sum(2)).max(1)))
+        # Neighbours within little more than the noise have no direction of a surface.
+        if reach_mm > _WIDER * white_mm or len(points) < 4 * _NEIGHBOURS:
+            break
+        points, apart_mm2 = points[::2], apart_mm2[:, ::2]
     at_mm = float(np.median(points[:, 2]))
     return DepthNoise(white_mm, 0.0, 0.0, 0.0, at_mm, apart_mm > _SPARSE_MM)
 
