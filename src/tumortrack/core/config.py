@@ -56,6 +56,8 @@ def from_builtins(data: object, kind: type[C], where: str) -> C:
     except msgspec.ValidationError as error:
         raise InputError(f"{where}: not a valid {kind.__name__}: {error}.") from error
     except InputError as error:  # of its own checks
+        if type(error) is not InputError:  # of a package: it says which
+            raise
         raise InputError(f"{where}: {error}") from error
 
 
