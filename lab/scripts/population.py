@@ -1,4 +1,4 @@
-"""Every KiTS19 kidney with a tumor: the list for a fleet, and the tables of docs/population.md.
+"""Every KiTS19 kidney with a tumor: the list for a fleet, and the tables of what came of it.
 
     make population ARGS='DATA --list population.csv'
     tumortrack fleet population.csv runs/population
@@ -69,7 +69,7 @@ class Options:
     """Only the first so many."""
     fleet: Path | None = None
     """Folder that `tumortrack fleet` wrote."""
-    document: Path = Path("docs/population.md")
+    document: Path = Path("docs/results.md")
     """A page that shows the tables, which go beside it with the plots."""
 
 

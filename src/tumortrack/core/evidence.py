@@ -21,7 +21,7 @@ from tumortrack.core.report import Point
 
 _REACH_MM = 2000.0  # of anything that a camera above a patient sees
 _LEAST_MM = 3.0  # no camera has an organ nearer
-FEWEST_TOUCHES = 12  # without a cloud; how far off 12, 24 and 48 leave it: docs/evidence_gain.md
+FEWEST_TOUCHES = 12  # without a cloud; `make evidence`: how far off 12, 24 and 48 leave it
 _LARGEST_FILE = 10_000_000  # bytes
 _LAST_NS = 2**63 - 1
 
