@@ -3,8 +3,10 @@
     make noise ARGS='OUT CASE=SCENES ...'       (about a second an answer)
 
 CASE: a folder with its model; SCENES: of `tumortrack simulate`, whose true organs are seen again
-under every condition, with the same seeds. Rows are kept in OUT, a file for each case and
-condition; the same command goes on where it was stopped.
+under every condition, with the same seeds. Clouds are the organ's, and not searched for it. Rows
+are kept in OUT, a file for each case and condition; the same command goes on where it was stopped.
+The page's are random kidneys by their number (`world.kidneys.random_anatomy`), prepared, with
+`tumortrack.write_scenes(CASE, SCENES, scenes=16, seed=77, elastic=True)`.
 """
 
 from __future__ import annotations
@@ -115,10 +117,12 @@ def table(frame: pd.DataFrame) -> pd.DataFrame:
     for text, rows in frame.groupby("condition", observed=True):
         condition, good = Condition.read(text), rows[rows.quality == "good"]
         answers = rows[rows.quality != "none"]
+        share, interval = share_words(len(good), len(rows)).rstrip(")").split(" % (")
         lines.append({
             "noise": condition.name, "at mm": f"{condition.distance_mm:g}",
             "depth's noise mm": f"{condition.noise_mm:.1f}", "scenes": len(rows),
-            "good": share_words(len(good), len(rows)), "no answer": len(rows) - len(answers),
+            "good %": share, "its 95 % interval": interval,
+            "no answer": len(rows) - len(answers),
             "tumor off mm: median": _text(answers.off_mm.median()),
             "95 %": _text(answers.off_mm.quantile(0.95)),
             "95 % of good": _text(good.off_mm.quantile(0.95)),
