@@ -94,15 +94,19 @@ def _rows(options: Options) -> Iterator[dict[str, Any]]:
         about |= {"case": store.sha256_of(Path(case) / store.MANIFEST)}
         for done, (text, condition) in enumerate(conditions.items(), number * len(conditions)):
             file = options.out / name / f"{text.replace(':', '-')}.json"
-            start, measure = time.monotonic(), partial(_measured, Path(case), paths, condition)
+            at = f"{done + 1}/{len(options.cases) * len(conditions)} {name} {text}"
+            measure = partial(_measured, Path(case), paths, condition, at)
             rows = scripts.kept(file, about | {"condition": text}, measure)
-            rate = f"{len(rows) / (time.monotonic() - start):.1f} answers a second"
-            say(f"{done + 1}/{len(options.cases) * len(conditions)} {name} {text}: {rate}")
             yield from ({"case": name, "condition": text, **row} for row in rows)
 
 
-def _measured(case: Path, paths: tuple[Path, ...], condition: Condition) -> list[dict[str, Any]]:
-    return noise.measured(*_ready(case, paths), condition)
+def _measured(
+    case: Path, paths: tuple[Path, ...], condition: Condition, at: str
+) -> list[dict[str, Any]]:
+    ready, start = _ready(case, paths), time.monotonic()
+    rows = noise.measured(*ready, condition)
+    say(f"{at}: {len(rows) / (time.monotonic() - start):.1f} answers a second")
+    return rows
 
 
 @cache
@@ -123,7 +127,7 @@ def table(frame: pd.DataFrame) -> pd.DataFrame:
             "depth's noise mm": f"{condition.noise_mm:.1f}", "scenes": len(rows),
             "good %": share, "its 95 % interval": interval,
             "no answer": len(rows) - len(answers),
-            "tumor off mm: median": _text(answers.off_mm.median()),
+            "worst tumor off mm: median": _text(answers.off_mm.median()),
             "95 %": _text(answers.off_mm.quantile(0.95)),
             "95 % of good": _text(good.off_mm.quantile(0.95)),
             "rigid fit: median": _text(answers.rigid_mm.median()),
