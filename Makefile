@@ -18,7 +18,7 @@ define INSTALL
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian clients kernels demo test test-all quick pythons pytest test-hard check attack fuzz crash replay fingerprint figures bench soak wheel lock licences audit results real world sequences plans pull pulls trust misses evidence rehearsal population site pictures clean
+.PHONY: help setup debian clients kernels demo test test-all quick pythons pytest test-hard check attack fuzz crash replay fingerprint figures bench soak wheel lock licences audit results real world sequences plans pull pulls trust misses evidence noise rehearsal population site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -157,6 +157,9 @@ evidence: setup  ## what touches, outlines, landmarks and held tumors bring, on 
 
 population: setup  ## KiTS19's kidneys with tumors: their list for a fleet, and what came of it (ARGS="DATA --list FILE", then --fleet OUT)
 	$(BIN)/python lab/scripts/population.py $(ARGS)
+
+noise: setup  ## good answers and tumors' errors against noise, cameras and distances (ARGS="OUT CASE=SCENES ..."; a second an answer)
+	$(BIN)/python lab/scripts/noise.py $(ARGS)
 
 rehearsal: setup  ## the experiment on a bench that does not exist, by all its commands (ARGS="CASE MODEL OUT", after make demo)
 	$(BIN)/python lab/scripts/rehearsal.py $(ARGS)

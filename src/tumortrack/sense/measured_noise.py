@@ -54,15 +54,16 @@ class DepthNoise(NamedTuple):
 
     def of_points(self, count: int, window_px: int = 0) -> PointNoise:
         """Of points of ``count`` pixels, each averaged over a window of so many pixels to either
-        side. Correlated noise is as that of so many patches of its length are independent."""
-        white = self.white_mm / (2 * window_px + 1)
+        side."""
+        point_mm, mean_mm = self.mean_mm((2 * window_px + 1) ** 2), self.mean_mm(max(count, 1))
+        return PointNoise(self.whole_mm, point_mm, mean_mm)
+
+    def mean_mm(self, pixels: int) -> float:
+        """Of the mean of neighbouring pixels. Correlated noise is as if so many patches of its
+        length were independent."""
         patch_px = max(np.pi * self.correlation_px**2, 1.0)
-        mean_mm2 = (self.white_mm**2 + patch_px * self.correlated_mm**2) / max(count, 1)
-        return PointNoise(
-            self.whole_mm,
-            float(np.hypot(white, self.correlated_mm)),
-            float(np.sqrt(min(mean_mm2, self.whole_mm**2))),
-        )
+        shared = self.correlated_mm**2 * min(patch_px / pixels, 1.0)
+        return float(np.sqrt(self.white_mm**2 / pixels + shared))
 
     @property
     def words(self) -> str:

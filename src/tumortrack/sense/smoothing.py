@@ -40,10 +40,10 @@ _NOISY_MM = 0.4  # less is what cameras have that nothing need be done for
 
 
 def window_px(frame: DepthFrame, noise: DepthNoise) -> int:
-    """Half the side, px, of the window in which so much white noise averages away; 0: none."""
-    pixel_mm = noise.depth_mm / frame.intrinsics.fx
-    wanted = np.ceil((noise.white_mm / _LEFT_MM - 1) / 2)
-    return int(np.clip(wanted, 0, max(1, _REACH_MM / pixel_mm)))
+    """Half the side, px, of the window in which enough of the noise averages away; 0: none."""
+    most = max(1, round(_REACH_MM * frame.intrinsics.fx / noise.depth_mm))
+    sides = range(most + 1)
+    return next((n for n in sides if noise.mean_mm((2 * n + 1) ** 2) <= _LEFT_MM), most)
 
 
 def smoothed(
@@ -54,7 +54,7 @@ def smoothed(
     height, width = frame.depth_mm.shape
     rows, columns = (np.arange(n)[s] for n, s in zip((height, width), sampled, strict=True))
     out = np.empty((len(rows), len(columns)), np.float32)
-    relative = noise.white_mm / noise.depth_mm**2  # of disparities: it grows with the square
+    relative = noise.whole_mm / noise.depth_mm**2  # of disparities: it grows with the square
     slope = _STEEPEST / frame.intrinsics.fx
     parallel_for(
         lambda part: _smooth(
