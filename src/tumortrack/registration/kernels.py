@@ -150,12 +150,7 @@ def add_rows(modes, field, flow, pose, points, buffers, rows):  # type: ignore[n
         row[0], row[1], row[2] = -sx, -sy, -sz
         row[3], row[4], row[5] = sy * oz - sz * oy, sz * ox - sx * oz, sx * oy - sy * ox
         row[POSE:-1] = 0
-        # At the surface, not at the point: else noise, which is in both factors of a gradient,
-        # would look like a strain along the normal.
-        off = row[-1] * per_cell
-        x, y, z = middles[0, p] - off * sx, middles[1, p] - off * sy, middles[2, p] - off * sz
-        add_modes(modes, x, y, z, inwards, row[POSE:-1])
-
+        add_modes(modes, middles[0, p], middles[1, p], middles[2, p], inwards, row[POSE:-1])
 
 @njit(fastmath=True, nogil=True, inline="always")
 def distance_at(values, origin, spacing, x, y, z):  # type: ignore[no-untyped-def]
