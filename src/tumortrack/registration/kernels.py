@@ -152,6 +152,7 @@ def add_rows(modes, field, flow, pose, points, buffers, rows):  # type: ignore[n
         row[POSE:-1] = 0
         add_modes(modes, middles[0, p], middles[1, p], middles[2, p], inwards, row[POSE:-1])
 
+
 @njit(fastmath=True, nogil=True, inline="always")
 def distance_at(values, origin, spacing, x, y, z):  # type: ignore[no-untyped-def]
     """Distance and its slope along x, y, z at one place (mm), by trilinear interpolation."""
