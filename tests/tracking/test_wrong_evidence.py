@@ -23,10 +23,12 @@ def explained(monkeypatch):
     mine = tracker.Tracker.__new__(tracker.Tracker)
     mine.model, mine._weakness = SimpleNamespace(), ""
 
-    def explain(evidence=(), cloud=None, known=()):
+    def explain(evidence=(), cloud=None, known=(), in_sight=None):
         points = SensorCloud(small_estimate().organ_mesh.vertices_mm)
         looks = (Look(points, points if cloud is None else cloud, HERE),)
-        estimate = small_estimate().reporting(evidence=evidence, timings={"total": 0.0})
+        estimate = small_estimate().reporting(
+            evidence=evidence, timings={"total": 0.0}, in_sight=in_sight
+        )
         how = FollowOptions(known={"other": known} if known else {})
         return mine._explained(estimate, looks, how)
 
@@ -72,3 +74,10 @@ def test_what_is_over_the_limit_reads_as_over_it(over_mm):
     assert shown[0] > shown[1]
     stored = Finding("miss", {"part": "tumor_1", "miss_mm": 7.0})  # as runs of before have it
     assert "7.0" in stored.words
+
+
+@pytest.mark.parametrize(("in_sight", "cause"), [(0.97, Cause.VIEW), (0.6, Cause.HIDDEN)])
+def test_a_hidden_side_is_blamed_only_where_something_hides_it(explained, in_sight, cause):
+    told = explained(in_sight=in_sight)
+    assert [likely.cause for likely in told.causes] == [cause]
+    assert told.advice

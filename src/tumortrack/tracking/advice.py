@@ -41,12 +41,13 @@ def advise(estimate: Estimate, part: str, reach: Reach | None = None) -> tuple[N
     return *advisor.touches(reach=reach), *advisor.others()
 
 
-def where_to_look(estimate: Estimate, looks: Sequence[Look]) -> str:
-    """The side of the organ that the camera should look at, in words.
+def where_to_look(estimate: Estimate, looks: Sequence[Look], hides: bool = True) -> str:
+    """The side of the organ that the camera should look at, in words. ``hides``: something may hide
+    a part of it.
 
-    If no view has points on more than a tenth of the side that faces the camera: that part.
-    Otherwise from where a look would tell most of the least sure tumor. Sides are those of the
-    first look's image.
+    If so, and if no view has points on more than a tenth of the side that faces the camera: that
+    part. Otherwise from where a look would tell most of the least sure tumor. Sides are those of
+    the first look's image.
     """
     organ = estimate.organ_mesh
     facing, centre = near_side(organ), organ.vertices_mm.mean(0)
@@ -54,7 +55,7 @@ def where_to_look(estimate: Estimate, looks: Sequence[Look]) -> str:
         [transform_points(look.camera_from_look, look.cloud.points_mm) for look in looks]
     )
     camera = "the first camera's" if len(looks) > 1 else "the camera's"
-    if len(facing) and len(points_mm):
+    if hides and len(facing) and len(points_mm):
         hidden = unseen(facing, points_mm)
         direction = facing[hidden].mean(0) - centre if hidden.mean() > _MAX_HIDDEN else np.zeros(3)
         if side := _side_in_words(direction, centre, camera):

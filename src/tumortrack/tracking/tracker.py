@@ -45,6 +45,7 @@ _TURNED_OVER_S = 30.0
 _CAUSES_EVERY_S = 1.0
 # Evidence outlasts a hand before the camera: tissue carries what lies on it, as it is seen again.
 _REMEMBERED_S = 60.0
+_NOTHING_HIDES = 0.9  # of the organ's image is in sight; the rest has no return, as at its edges
 _NO_CAUSE = (Likely(Cause.VIEW),)
 _FARTHEST_MM = 700.0  # of an organ before a camera on a stand
 _OF_POSES = "none", "poses", "fit", "strays", "seen_through"  # checks that wrong poses fail
@@ -162,9 +163,12 @@ class Tracker:
         if estimate.finding is not None and not self._weakness:
             causes = self._causes(looks, how, estimate)
             alone = isinstance(looks[0].seen, SensorCloud) and not len(looks[0].seen.points_mm)
-            if alone:  # touches hide nothing, and no camera can look elsewhere
+            # Touches hide nothing, and no camera can look elsewhere.
+            in_sight = estimate.report.in_sight
+            hides = not alone and (in_sight is None or in_sight < _NOTHING_HIDES)
+            if not hides:
                 causes = tuple(c for c in causes if c.cause is not Cause.HIDDEN) or _NO_CAUSE
-            view = TOUCH_MORE if alone else where_to_look(estimate, looks)
+            view = TOUCH_MORE if alone else where_to_look(estimate, looks, hides)
             advice = words(causes, view)
             estimate = replace(estimate, causes=causes, advice=advice)
         return _timed(estimate, "explain", start)
