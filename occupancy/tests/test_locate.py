@@ -382,7 +382,7 @@ def test_depth_images_take_the_range_the_model_was_trained_for(work, scenes):
     depth = ["locate", work / "model", scene / "depth.png", work / "depth"]
     assert "--intrinsics" in refusal(tumortrack(*depth))
     depth += ["--intrinsics", scene / "intrinsics.json", "--grid", 48]
-    assert "depth_unit_mm" in refusal(tumortrack(*depth, "--unit", "m"))
+    assert "--depth-unit" in refusal(tumortrack(*depth, "--unit", "m"))
     said = answered(tumortrack(*depth))
     assert "in steps of 0.1 mm (stated in intrinsics.json)" in said
     found = json.loads((work / "depth" / "report.json").read_text())["parts"]["tumor_1"]

@@ -271,7 +271,7 @@ def test_the_command_takes_several_views(slim_model, tmp_path):
     out = tmp_path / "out"
     command = "locate", slim_model, left
     assert "--poses FILE with several views" in refusal(tumortrack(*command, right, out, *options))
-    assert "and only then" in refusal(tumortrack(*command, out, *options, *poses))
+    assert "--poses" in refusal(tumortrack(*command, out, *options, *poses))
     three = refusal(tumortrack(*command, right, left, out, *options, *poses))
     assert "2 poses for 3 views" in three
     assert not out.exists()

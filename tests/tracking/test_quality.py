@@ -13,7 +13,7 @@ from reports import looked, reporting
 from stories import answered, refusal, succeeded, tumortrack
 from tumortrack.core import store
 from tumortrack.core.errors import NoEstimate
-from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
+from tumortrack.core.types import DepthFrame, Mesh, PointNoise, SensorCloud
 from tumortrack.models.folder import weakness_of
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.sense.camera import d405
@@ -104,7 +104,8 @@ def test_strays_are_no_part_of_the_fit_that_is_judged(tracker, stages):
     clean = tracker.follow(stages[0].cloud)
     low, high = points.min(0), points.max(0)
     anywhere = low + (high - low) * rng.uniform(-0.1, 1.1, points.shape)
-    spoiled = SensorCloud(np.where(rng.random((len(points), 1)) < 0.35, anywhere, points))
+    strays = np.where(rng.random((len(points), 1)) < 0.35, anywhere, points)
+    spoiled = SensorCloud(strays, noise=PointNoise())  # measured already: nothing is cleaned away
     found = tracker.follow(spoiled)
     away = found.motion.centre_mm - clean.motion.centre_mm  # an ellipsoid may lie both ways round
     assert np.linalg.norm(away) < 2

@@ -3,7 +3,6 @@ each view, and all views fitted as one."""
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -61,7 +60,7 @@ class ViewsLocator:
         # Of the first camera by its calibration, of others as they come.
         self.frames = FrameCheck(context.published_frame, region, frozen_s)
         self._frames = {1: self.frames}
-        self._noises: dict[int, tuple[float, DepthNoise]] = {}  # of each camera, and when
+        self._noises: dict[int, tuple[int, DepthNoise]] = {}  # of each camera, and when
         self.tools = Tools({}, context, self.frames.notes)
         self.evidence: tuple[Evidence, ...] = ()  # that the present frame brought
 
@@ -119,13 +118,13 @@ class ViewsLocator:
             doubt = frames.check(seen)
         with timed(seconds, "organ"):
             rng = np.random.default_rng((self._seed, seen.stamp_ns))
-            measured_s, noise = self._noises.get(view.number, (-math.inf, None))
-            if time.monotonic() - measured_s > _NOISE_S:
+            measured_ns, noise = self._noises.get(view.number, (0, None))
+            if not 0 <= seen.stamp_ns - measured_ns < _NOISE_S * 1e9:  # a replay does the same
                 noise = None
             hints = replace(self._hints(view), noise=noise)
             organ = organ_points(seen.content, self._region, hints, rng)
             if noise is None and organ.noise is not None:
-                self._noises[view.number] = time.monotonic(), organ.noise
+                self._noises[view.number] = seen.stamp_ns, organ.noise
         frames.check_new(seen.content)  # that it shows nothing would be said before
         return organ.cloud, "; ".join(filter(None, (doubt, organ.doubt)))
 

@@ -43,6 +43,7 @@ _FLAT, _ROUND = 0.04, 0.02
 # (other kidneys have 0.9).
 _BACKGROUND_MM, _BACKGROUND_SHARE, _FITS_WITHOUT = 10.0, 0.03, 0.85
 _NOT_THIS = "fit", "seen_through"  # checks that speak against this organ in this place
+_NEARLY = 0.9  # of the usual cost: nine tenths of the right fits cost less
 _GUESSED = (Cause.ANOTHER_PATIENT,)
 _HELPED_BY_A_VIEW = Cause.HIDDEN, Cause.ANOTHER_PATIENT, Cause.VIEW
 # Hidden shares of the near side, and the points' spread relative to the near side's. Other
@@ -161,7 +162,7 @@ def _by_coverage(model: Model, points: Points, fit: _Fit) -> list[Likely]:
         causes.append(Likely(Cause.BACKGROUND, background))
     if check == "unseen" or (hidden > _HIDDEN and check not in _NOT_THIS) or mostly:
         causes.append(Likely(Cause.HIDDEN, hidden))
-    if check in _NOT_THIS:
+    if check in _NOT_THIS or fit.cost > _NEARLY:
         other = Cause.OBJECT if check == "seen_through" else Cause.DEFORMED
         causes += [Likely(Cause.ANOTHER_PATIENT), Likely(other)]
     return causes
