@@ -12,14 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.report import Cause, Likely
-from tumortrack.core.types import Anatomy, SensorCloud
+from tumortrack.core.types import Anatomy, PointNoise, SensorCloud
 from tumortrack.imaging.surface import surfaces
 from tumortrack.phantom.digital import PhantomParameters, phantom_labels
 from tumortrack.sense.units import Unit
 from tumortrack.simulate.deform import DragConfig
 from tumortrack.simulate.scene import SceneRecipe, Simulator
 from tumortrack.tracking import tracker as tracking
-from tumortrack.tracking.causes import words
+from tumortrack.tracking.causes import likely_causes, words
 from tumortrack.tracking.files import report_entry
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
@@ -124,6 +124,18 @@ def test_another_patients_organ_is_named_as_such(tracker, size_mm):
         assert verdict != "good"
         assert causes[0].cause is Cause.ANOTHER_PATIENT
         assert "perhaps another patient's organ, or the other side's" in reason
+
+
+def test_where_noise_is_large_no_patient_is_told_from_another(tracker):
+    another = PhantomParameters(size_mm=(80.0, 70.0, 120.0), bend_mm=2.0, shape_seed=3, taper=0.3)
+    anatomy, _ = surfaces(phantom_labels(another, voxel_mm=2.0))
+    places = seen(tracker, anatomy, 0).astype(np.float32)
+    for noise_mm, first in ((0.3, Cause.ANOTHER_PATIENT), (1.6, Cause.NOISE)):
+        cloud = SensorCloud(places, noise=PointNoise(noise_mm, 0.3, 0.01))
+        causes = likely_causes(tracker.model, cloud, tracker.locate(cloud, 16))
+        assert causes[0].cause is first
+    assert causes[0].number == 1.6
+    assert Cause.ANOTHER_PATIENT not in [one.cause for one in causes]
 
 
 def test_causes_are_sought_once_a_second_at_most(tracker, points, monkeypatch):

@@ -315,15 +315,15 @@ class FitReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
 Cause = Enum(
     "Cause",
     "UNIT FRAME MIRRORED SCALE OBJECT BACKGROUND HIDDEN ANOTHER_PATIENT DEFORMED POSES VIEW "
-    "EVIDENCE",
+    "EVIDENCE NOISE",
 )
 
 
 @dataclass(frozen=True)
 class Likely:
     """A likely cause. ``number``: the factor of UNIT and SCALE, the share of BACKGROUND and HIDDEN,
-    of EVIDENCE the piece, from 1. ``fit``: cost of the fit without it over the model's usual cost;
-    None: not tried."""
+    of EVIDENCE the piece, from 1, of NOISE its standard deviation, mm. ``fit``: cost of the fit
+    without it over the model's usual cost; None: not tried."""
 
     cause: Cause
     number: float | None = None

@@ -85,7 +85,8 @@ class View:
             unit = "in metres" if unit_mm == 1000 else f"in steps of {unit_mm:g} mm"
             words += f"depth {unit} ({stated_by}); "
         found = organ_points(self.content, region, hints, np.random.default_rng(options.seed))
-        noise = found.noise or noise_of(self.content)
+        depth = isinstance(self.content, DepthFrame)
+        noise = found.noise if depth else noise_of(self.content)
         entry |= {} if noise is None else {"noise": noise.entry}
         last = "" if noise is None else f"; {noise.words}"
         return OrganInView(found.cloud, entry, found.taken, (words, last)).with_pixels(found.taken)

@@ -123,7 +123,7 @@ def organ_points(
         }
         raise NoEstimate(Finding("few_points", values))
     drawn = rng.choice(remaining, min(len(remaining), config.crop.n_points), replace=False)
-    beside = np.setdiff1d(possible, remaining, assume_unique=True)
+    beside = possible[np.isin(possible, remaining, assume_unique=True, invert=True)]
     most = min(round(len(beside) * len(drawn) / len(remaining)), _MOST_CANDIDATES)
     beside = rng.choice(beside, most, replace=False)
     pixels = counts["organ"] * image.step_px**2
