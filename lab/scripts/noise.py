@@ -1,6 +1,6 @@
 """With which noise, cameras and distances are answers still good, and how far off are tumors?
 
-    make noise ARGS='OUT CASE=SCENES ...'       (about a second an answer)
+    make noise ARGS='OUT CASE=SCENES ...'
 
 CASE: a folder with its model; SCENES: of `tumortrack simulate`, whose true organs are seen again
 under every condition, with the same seeds. Clouds are the organ's, and not searched for it. Rows

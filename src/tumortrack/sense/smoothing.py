@@ -25,7 +25,7 @@ from tumortrack.sense.measured_noise import (
     scattered_share,
 )
 
-# What is left is less than what the fit's own ``sigma_mm`` contains, and flat patches of this
+# Less noise than this is below what the fit's own ``sigma_mm`` contains, and flat patches of this
 # radius leave 0.1 mm of a ball of 25 mm.
 _LEFT_MM, _REACH_MM = 0.25, 3.0
 _STEEPEST = 2.0  # slope up to which neighbours are of one surface
