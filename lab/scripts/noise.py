@@ -44,6 +44,8 @@ _CONDITIONS = (
     "correlated:0.5:8", "correlated:1:8", "correlated:2:8",
     "d405-measured@150", "d405-measured@300", "d405-measured@500", "d405-measured:0@500",
     "d435@300", "zed@400", "zed:0@400", "azure-kinect@400", "structured-light@500",
+    "scale:3", "depth:4", "uncalibrated-d405-measured@150", "uncalibrated-d405-measured@300",
+    "uncalibrated-d435@300", "uncalibrated-azure-kinect@400", "uncalibrated-structured-light@500",
     "cloud:1", "cloud:2", "strays:20", "strays:40", "fat:15",
 )  # fmt: skip
 _COLUMNS = ["case", "condition", "quality", "check", "off_mm", "rigid_mm", "beyond", "seconds"]
@@ -58,7 +60,8 @@ class Options:
     cases: tyro.conf.Positional[tuple[str, ...]]
     """CASE=SCENES: a case with its model, and a folder of scenes of it."""
     conditions: tuple[str, ...] = _CONDITIONS
-    """white:MM, correlated:MM:PX, cloud:MM, strays:%, fat:%, CAMERA or CAMERA:TIMES its noise, and
+    """white:MM, correlated:MM:PX, cloud:MM, strays:%, fat:%, scale:%, depth:MM, CAMERA,
+    uncalibrated-CAMERA, or CAMERA:TIMES its noise, and
     from where: @MM."""
     count: int = 16
     """Scenes of each case, at most."""
@@ -161,6 +164,7 @@ def draw(frame: pd.DataFrame, path: Path) -> None:
         off.plot(mm, errors.off_mm[[*texts]], **style)
         off.plot(mm, errors.rigid_mm[[*texts]], "--", color=f"C{number}", linewidth=1)
     cameras = [t for t, c in of.items() if c.kind in FIGURES and c.amount == 1]
+    cameras = [text for text in cameras if not of[text].uncalibrated]
     names = [f"{of[text].name}, {of[text].distance_mm:g} mm" for text in cameras]
     for axes, values in ((other, share), (off_other, errors.off_mm)):
         axes.plot(range(len(cameras)), values[cameras], "o", color="0.2")

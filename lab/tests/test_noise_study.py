@@ -61,6 +61,18 @@ def test_a_camera_errs_by_its_noise_at_the_distance():
     assert not np.array_equal(seen("white:1").depth_mm, seen("white:1", seed=2).depth_mm)
 
 
+def test_a_bias_is_to_either_side_and_unstated_and_cameras_state_theirs():
+    for number, off_mm in ((0, -4.0), (1, 4.0)):
+        biased = seen("depth:4", seed=number)
+        np.testing.assert_allclose(biased.depth_mm - FLAT.depth_mm, off_mm, atol=1e-3)
+        assert biased.intrinsics.depth_error is None
+    np.testing.assert_allclose(seen("scale:3").depth_mm, 1.03 * FLAT.depth_mm, rtol=1e-5)
+    right, raw = seen("d435@300"), seen("uncalibrated-d435@300")
+    assert right.intrinsics.depth_error == (0.0, 0.0)
+    assert raw.intrinsics.depth_error == (5.0, 0.02)
+    assert abs(np.nanmedian(raw.depth_mm - right.depth_mm)) > 0.3
+
+
 def test_clouds_have_noise_strays_or_a_lump_as_asked():
     _, frame = placed(ANATOMY, 150.0)
     low, high = deproject(frame).min(0), deproject(frame).max(0)

@@ -437,9 +437,9 @@ def locate(model: StrPath, clouds: StrPath | Sequence[StrPath], **options: Any) 
 
     Args:
         model: folder of a case, or that ``train`` wrote.
-        options: as on the command line: ``range``, ``box``, ``whole``, ``at``, ``mask``,
-            ``poses``, ``intrinsics`` (one for each view), ``depth_unit``, ``unit``, ``grid``,
-            ``seed``, ``evidence``, ``map``, ``case``, ``patient``, ``side``, ``device``.
+        options: as on the command line: ``range``, ``box``, ``whole``, ``depth_error``, ``at``,
+            ``mask``, ``poses``, ``intrinsics`` (one for each view), ``depth_unit``, ``unit``,
+            ``grid``, ``seed``, ``evidence``, ``map``, ``case``, ``patient``, ``side``, ``device``.
 
     Returns:
         ``estimate``, which is None where nothing could be located; ``report``, as in report.json;
@@ -600,7 +600,7 @@ def track(
         until: called with every result; True ends the loop.
         seconds: end so many s after the first frame; 0: not.
         range_mm: depths to keep (default: those of the model's scenes).
-        options: as on the command line: ``box``, ``whole``, ``intrinsics``,
+        options: as on the command line: ``box``, ``whole``, ``depth_error``, ``intrinsics``,
             ``frame``, ``views``, ``poses``, ``moving``, ``tool``, ``scan``, ``smoothing``,
             ``rescan``, ``stale``, ``frozen``, ``give_up``, ``report``, ``seed``, ``patient``,
             ``side``, ``device``.

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image, ImageFont
 
 import tumortrack as tt
+from depth_files import write_frame_folder
 from live_objects import ball, small_estimate
 from region_objects import ORGAN, Props, make_scene
 from reports import reporting
@@ -19,6 +20,7 @@ from tumortrack.core import colours
 from tumortrack.core.errors import StorageError
 from tumortrack.core.geometry import plane_section
 from tumortrack.core.report import Finding
+from tumortrack.core.types import Intrinsics
 from tumortrack.imaging.case import load_case
 from tumortrack.report.run_page import PICTURE, write_run_page
 from tumortrack.report.seen import PAGE, Seen
@@ -50,6 +52,19 @@ def raw(tmp_path, phantom_case):
     Image.fromarray((depth_mm / 1000).astype(np.float32)).save(tmp_path / "m.tif")
     Image.fromarray((seen.what == ORGAN).astype(np.uint8)).save(tmp_path / "mask.png")
     return tmp_path
+
+
+@pytest.mark.parametrize("size", [(1024, 768), (1366, 768), (401, 301)])
+def test_a_depth_image_of_any_size_has_its_page(size, clinic_model, phantom_case, tmp_path):
+    organ = load_case(phantom_case).anatomy.organ
+    camera = Intrinsics(*size, 0.7 * size[0], 0.7 * size[0], size[0] / 2, size[1] / 2)
+    frame = make_scene(organ, HAND, np.random.default_rng(3), camera).frame
+    write_frame_folder(tmp_path / "scene", frame)
+    paths = {"intrinsics": (tmp_path / "scene" / "intrinsics.json",)}
+    tt.locate(clinic_model, tmp_path / "scene" / "depth.png", grid=32, **paths).save(
+        str(tmp_path / "run")
+    )
+    assert (tmp_path / "run" / PAGE).is_file()
 
 
 def test_the_organ_is_found_in_a_raw_depth_image(raw, clinic_model, phantom_case):

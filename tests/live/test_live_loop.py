@@ -17,7 +17,7 @@ from live_objects import small_frame
 from reports import poor
 from tumortrack.core.errors import InputError, NoEstimate, StorageError
 from tumortrack.core.estimate import FollowOptions
-from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
+from tumortrack.core.types import DepthError, DepthFrame, Intrinsics, SensorCloud
 from tumortrack.live.loop import Loop, LoopConfig, summary
 from tumortrack.live.values import (
     Controls,
@@ -424,7 +424,10 @@ def test_other_intrinsics_replace_the_sources(tracker):
     sink = Notes()
     for intrinsics, said in ((given, None), (Intrinsics(32, 48, 30, 30, 15, 23), "32 x 48")):
         correction = DepthCorrection(scale=0.99, offset_mm=2.0)
-        loop = Loop(tracker, setting, LoopConfig(intrinsics=intrinsics, correction=correction))
+        config = LoopConfig(
+            intrinsics=intrinsics, correction=correction, depth_error=DepthError(0.5)
+        )
+        loop = Loop(tracker, setting, config)
         outlets = [SinkWorker("notes", sink, 10)]
         reader = SourceWorker(lambda: Script([frame]))
         loop.run(reader, outlets, lambda _: None)
@@ -433,6 +436,7 @@ def test_other_intrinsics_replace_the_sources(tracker):
         if said is None:
             content = sink.updates[-1].observation.content
             assert content.intrinsics == given
+            assert content.intrinsics.depth_error == DepthError(0.5)
             corrected_mm = frame.depth_mm * 0.99 + 2
             np.testing.assert_allclose(content.depth_mm, corrected_mm, rtol=1e-5)
         else:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from depth_objects import SMALL, dome, pixels
+from noise_objects import seen
 from region_objects import (
     DIFFICULTIES,
     DRAPED,
@@ -33,6 +34,7 @@ from tumortrack_lab.world.kidneys import random_anatomy
 WIDE = CloudConfig(near_mm=60.0, far_mm=400.0)
 EVERY = CloudConfig(near_mm=60.0, far_mm=400.0, n_points=10**6)
 CONFIG = RegionConfig(crop=WIDE)
+FAR = RegionConfig(crop=CloudConfig(near_mm=300.0, far_mm=700.0))
 NOTHING = RegionConfig(crop=EVERY, plane=False, flying=False, pieces=False)
 
 
@@ -194,32 +196,6 @@ def banded(frame, along, width_px, depth_mm=100.0):
     return DepthFrame(np.where(band, depth_mm, frame.depth_mm), SMALL), band
 
 
-@pytest.mark.parametrize("width_px", [14, 30, 60])  # 8 to 34 mm: a shaft, a finger, two
-@pytest.mark.parametrize("along", [(0, 0), (10, -35), (-25, 25)])
-def test_an_organ_behind_an_occluder_stays_one(along, width_px):
-    """A band parts a dome, 50 to 50 to some 80 to 20; both parts are found, nothing of the band."""
-    organ = np.isfinite(dome().depth_mm)
-    frame, band = banded(dome(), along, width_px)
-    found = points(frame, RegionConfig(crop=EVERY)).taken == 0
-    assert not found[band].any()
-    assert found[organ & ~band].mean() > 0.95
-    alone = points(frame, RegionConfig(crop=EVERY, gap_mm=0.0)).taken == 0
-    assert alone[organ & ~band].mean() < 0.85
-
-
-def test_a_parted_organ_counts_as_a_whole():
-    """Beside something larger than each of its parts."""
-    u, v = pixels(SMALL)
-    frame, band = banded(dome(), (0, 0), 40)
-    organ = np.isfinite(dome().depth_mm) & ~band
-    beside = (np.abs(u - 385) < 37) & (np.abs(v - 120) < 75)
-    assert not (beside & organ).any()
-    depth = np.where(beside, 170 + 0.1 * np.abs(u - 385), frame.depth_mm)
-    found = points(DepthFrame(depth, SMALL), RegionConfig(crop=EVERY, plane=False)).taken == 0
-    assert found[organ].mean() > 0.95
-    assert not found[beside].any()
-
-
 def test_two_bodies_stay_two_behind_an_occluder():
     """Two domes side by side, whose outlines a band hides: they would meet in a valley."""
     u, v = pixels(SMALL)
@@ -246,17 +222,6 @@ def test_what_lies_on_both_sides_of_an_organ_is_not_one():
     found = points(DepthFrame(depth, SMALL), RegionConfig(crop=EVERY, plane=False)).taken == 0
     assert found[organ].mean() > 0.95
     assert not found[bed].any()
-
-
-def test_what_would_be_larger_than_an_organ_stays_apart():
-    u, v = pixels(SMALL)
-    wall = (np.abs(u - SMALL.cx) < 170) & (np.abs(v - SMALL.cy) < 60)
-    frame, band = banded(DepthFrame(np.where(wall, 140.0, np.nan), SMALL), (0, 40), 30)
-    for longest_mm, parts in ((140.0, 1), (300.0, 2)):
-        config = RegionConfig(crop=EVERY, plane=False, organ_mm=(30.0, longest_mm))
-        found = points(frame, config).taken == 0
-        assert found[wall & (u < SMALL.cx)].mean() > 0.9
-        assert found[wall & ~band & (u > SMALL.cx + 60)].any() == (parts == 2)
 
 
 def test_stray_points_go():
@@ -375,3 +340,25 @@ def test_where_the_range_takes_all_the_unit_is_named():
     away = DepthFrame(frame.depth_mm + 90, SMALL)
     with pytest.raises(NoEstimate, match="move the camera"):
         organ_points(away, RegionConfig(), Hints(), np.random.default_rng(0))
+
+
+def test_noise_is_measured_where_the_organ_is():
+    """A bar near the camera is less noisy than the organ far behind it."""
+    frame = seen(848, 430, behind_mm=60.0)
+    bar = np.zeros(frame.depth_mm.shape, bool)
+    bar[40:120] = True
+    depth = np.where(bar, 160.0, frame.depth_mm)
+    white = np.where(bar, 0.2, 0.8) * np.random.default_rng(0).standard_normal(depth.shape)
+    image = frame.with_depth((depth + white).astype(np.float32))
+    wide = RegionConfig(crop=CloudConfig(near_mm=60.0, far_mm=700.0))
+    for config, mask in ((wide, None), (wide, ~bar), (FAR, None)):
+        region = points(image, config, mask=mask)
+        assert region.noise.white_mm == pytest.approx(0.8, rel=0.15)
+        assert region.noise.depth_mm == pytest.approx(460, abs=50)
+
+
+def test_what_else_may_be_the_organ_comes_with_it():
+    region = points(two_domes())
+    (other,) = region.cloud.others
+    assert np.median(column_of(region.cloud)) < 220 < np.median(column_of(other))
+    assert points(two_domes(), picked_mm=region.cloud.points_mm[0]).cloud.others == ()

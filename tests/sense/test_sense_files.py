@@ -5,6 +5,7 @@ import json
 import math
 import struct
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,10 +15,16 @@ from hypothesis import strategies as st
 from depth_files import write_depth_png, write_intrinsics
 from depth_objects import SMALL, dome, pixels, wall
 from tumortrack.core.errors import InputError
-from tumortrack.core.types import Intrinsics
+from tumortrack.core.types import DepthError, Intrinsics
 from tumortrack.sense.camera import d405, deproject
 from tumortrack.sense.cloud import CloudConfig, check_cloud, cloud_from_depth
-from tumortrack.sense.files import intrinsics_json, read_cloud, read_depth_png, read_intrinsics
+from tumortrack.sense.files import (
+    CALIBRATED_MM,
+    intrinsics_json,
+    read_cloud,
+    read_depth_png,
+    read_intrinsics,
+)
 from tumortrack.sense.noise import NoiseConfig, add_noise
 from tumortrack.sense.ply import write_cloud_ply
 
@@ -309,6 +316,27 @@ def test_depths_are_corrected_as_the_intrinsics_file_says(tmp_path):
     for wrong in ({"depth_scale": 98.0}, {"depth_offset_mm": 21}, {"depth_offset_mm": "1 mm"}):
         camera.write_text(json.dumps(stated | wrong))
         with pytest.raises(InputError, match=next(iter(wrong)).removeprefix("depth_")):
+            read_depth_png(png, camera)
+
+
+def test_what_a_calibration_leaves_is_the_cameras(tmp_path):
+    png, camera = tmp_path / "depth.png", tmp_path / "intrinsics.json"
+    write_depth_png(png, wall(130.0))
+    stated = intrinsics_json(SMALL)
+    expected = {
+        None: {},
+        0.4: {"depth_left_mm": 0.4},
+        CALIBRATED_MM: {"depth_scale": 0.99},
+        0.0: {"depth_offset_mm": 1.0, "depth_left_mm": 0},
+    }
+    for left_mm, more in expected.items():
+        camera.write_text(json.dumps(stated | more))
+        error = read_depth_png(png, camera).intrinsics.depth_error
+        assert error == (None if left_mm is None else DepthError(left_mm))
+        assert intrinsics_json(replace(SMALL, depth_error=error)).get("depth_left_mm") == left_mm
+    for wrong in (-1, 21, "1 mm"):
+        camera.write_text(json.dumps(stated | {"depth_left_mm": wrong}))
+        with pytest.raises(InputError, match="depth_left_mm"):
             read_depth_png(png, camera)
 
 

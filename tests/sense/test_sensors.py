@@ -14,7 +14,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, Intrinsics
 from tumortrack.sense.measured_noise import depth_step_mm, image_noise
 from tumortrack.sense.noise import D405_NOISE, STEREO_NOISE, add_noise
-from tumortrack.sense.sensors import FIGURES, simulated
+from tumortrack.sense.sensors import FIGURES, depth_error_of, simulated
 from tumortrack.simulate.scene_folder import read_scene
 from tumortrack.tracking.options import SimulatedSensor, SimulateOptions
 
@@ -261,3 +261,20 @@ def test_simulate_writes_scenes_of_another_camera(phantom_case, tmp_path):
     noise = scene.meta["config"]["noise"]
     assert (noise["unit"], noise["calibrated"]) == (3, False)
     assert noise["temporal_px"] == FIGURES["d435"]["temporal_px"][0]
+
+
+def test_a_cameras_error_is_stated_in_mm_or_by_its_kind():
+    assert depth_error_of("") is None
+    assert depth_error_of("0.5") == (0.5, 0.0)
+    assert depth_error_of("d405-measured") == (5.0, 0.02)
+    assert depth_error_of("azure-kinect") == (25.0, 0.001)  # 10, and 15 of tissue
+    for wrong in ("-1", "30", "nan", "d999"):
+        with pytest.raises(InputError, match=r"0 to 20.*d435"):
+            depth_error_of(wrong)
+
+
+def test_only_a_calibrated_camera_is_stated_to_be_right():
+    assert D405_NOISE.depth_error == (0.0, 0.0)
+    assert simulated("d435").depth_error == (0.0, 0.0)
+    assert simulated("d435", uncalibrated=True).depth_error is None
+    assert simulated("azure-kinect", tissue=True).depth_error is None

@@ -21,7 +21,7 @@ Check = Literal[
 ]
 Kind = Literal[
     "not_judged", "poses", "strays", "fit", "size", "upside_down", "tilted", "not_turned", "rival",
-    "missing", "unsure", "miss", "improbable", "seen_through", "unseen", "hidden_now",
+    "missing", "unsure", "miss", "depths", "improbable", "seen_through", "unseen", "hidden_now",
     "evidence", "disputed", "beyond_margins", "model", "frame_in_doubt", "good_again",
     # No estimate: the frame or its source.
     "no_frame", "source", "defect", "stamp_negative", "stamp_back", "stale", "future", "too_late",
@@ -103,7 +103,8 @@ class PartReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     ``center_axes``: unit vectors along which the centre has the deviations
     ``center_axes_std_mm``, the least sure first; ``nearest_mm``: from the centre to the nearest
     point that was seen; ``held_by_prior_mm``: how far the elastic prior, against the points, holds
-    the centre; ``miss_mm``: within which 95 % of such tumors' centres lie, as learned from
+    the centre; ``fit_std_mm``: the largest deviations of centre and surface without the camera's
+    common error; ``miss_mm``: within which 95 % of such tumors' centres lie, as learned from
     simulated kidneys. None: not found, or the method does not know."""
 
     label: int
@@ -119,6 +120,7 @@ class PartReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     surface_std_mm: float | None = None
     nearest_mm: float | None = None
     held_by_prior_mm: float | None = None
+    fit_std_mm: tuple[float, float] | None = None
     miss_mm: float | None = None
 
     @property
@@ -164,10 +166,11 @@ class FitCost(_Value, frozen=True, kw_only=True):
 
 
 class SizeFit(_Value, frozen=True, kw_only=True):
-    """An organ so many ``times`` as large costs less by ``gain``."""
+    """An organ so many ``times`` as large costs less by ``gain``; ``std``: of ``times``."""
 
     times: float
     gain: float
+    std: float
 
 
 class SmoothingReport(_Value, frozen=True, kw_only=True):
@@ -239,13 +242,15 @@ class AllowedPoses(_Value, frozen=True, kw_only=True):
 
 class MotionReport(_Value, frozen=True, kw_only=True):
     """The fitted motion: pose, elastic ``coefficients``, Gauss-Newton ``steps``. ``rarity``: of the
-    library's state; ``compliance_std_mm``: of the compliance, whose coefficients are the last."""
+    library's state; ``compliance_std_mm``: of the compliance, whose coefficients are the last;
+    ``depth_std_mm``: of what the camera's depths err by, all alike, at the organ."""
 
     camera_from_ct: tuple[tuple[float, float, float, float], ...]
     coefficients: tuple[float, ...]
     rarity: float
     steps: int
     compliance_std_mm: float | None
+    depth_std_mm: float
 
 
 class StatedMargin(_Value, frozen=True, kw_only=True):

@@ -184,9 +184,22 @@ def part_names(n_parts: int, organ: str) -> tuple[str, ...]:
     return (organ, *(f"tumor_{n}" for n in range(1, n_parts)))
 
 
+class DepthError(NamedTuple):
+    """How far off a camera's depths are at most, the same for all: mm, and a share of the depth.
+    Each unit errs by its own, uniformly to either side."""
+
+    offset_mm: float = 0.0
+    scale: float = 0.0
+
+    def share(self, depth_mm: float) -> float:
+        """Standard deviation at a depth, as a share of it."""
+        return float(np.hypot(self.offset_mm / depth_mm, self.scale)) / 3**0.5
+
+
 @dataclass(frozen=True)
 class Intrinsics:
-    """Pinhole camera without distortion; pixel centres at whole numbers. Lengths in pixels."""
+    """Pinhole camera without distortion; pixel centres at whole numbers. Lengths in pixels.
+    ``depth_error``: of its depths; None: nobody has stated it."""
 
     width: int
     height: int
@@ -194,9 +207,10 @@ class Intrinsics:
     fy: float
     cx: float
     cy: float
+    depth_error: DepthError | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
-        six = [float(getattr(self, f.name)) for f in fields(self)]
+        six = [float(getattr(self, f.name)) for f in fields(self) if f.compare]
         if not np.isfinite(six).all() or min(self.fx, self.fy) <= 0:
             raise InputError(f"intrinsics {six} are not usable; fx and fy must be positive pixels.")
         if not (0 < self.width <= 8192 and 0 < self.height <= 8192):
@@ -234,7 +248,8 @@ class PointNoise(NamedTuple):
 class SensorCloud:
     """Points seen by the sensor, camera frame, mm, float32, all finite. ``noise``: of the points,
     as measured; None: not yet. ``candidates_mm``: points beside them that may be the organ's too,
-    as dense as they are."""
+    as dense as they are. ``depth_error``: of the camera; None: nobody has stated it. ``others``:
+    what else in the image may be the organ instead, the likeliest first."""
 
     points_mm: Float32[np.ndarray, "n 3"]
     stamp_ns: int = 0
@@ -242,6 +257,8 @@ class SensorCloud:
     candidates_mm: Float32[np.ndarray, "c 3"] = field(
         default_factory=lambda: np.zeros((0, 3), np.float32)
     )
+    depth_error: DepthError | None = None
+    others: tuple[SensorCloud, ...] = ()
 
     def __post_init__(self) -> None:
         _freeze(self, "points_mm", np.float32, (None, 3))

@@ -23,14 +23,14 @@ from tumortrack.core.estimate import Estimate, Quality
 from tumortrack.core.evidence import Evidence
 from tumortrack.core.halt import Halt
 from tumortrack.core.report import Finding
-from tumortrack.core.types import DepthFrame, Intrinsics
+from tumortrack.core.types import DepthError, DepthFrame, Intrinsics
 from tumortrack.live import values as live
 from tumortrack.live.cameras import Cameras
 from tumortrack.live.meter import RunStatistics
 from tumortrack.live.values import CameraView, Observation, SourceLost, TrackingResult
 from tumortrack.live.views import OrganInView, Scan, ViewsLocator, camera_words, timed
 from tumortrack.live.workers import OPENING_S, SinkWorker, SourceWorker
-from tumortrack.sense.camera import d405
+from tumortrack.sense.camera import d405, with_depth_error
 from tumortrack.sense.files import DepthCorrection
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
@@ -44,14 +44,15 @@ class LoopConfig(Config, frozen=True, kw_only=True):
     """``stale_s``: after this time without a frame, or with one that old, there is 'no estimate'.
     ``give_up_s``: after this time without a frame the loop ends. Neither counts a source's opening,
     nor holds for one whose frames are made ``on_demand``. ``intrinsics``: replace the
-    source's, ``correction`` of depths included. ``frozen_s``: an image that repeats bit for bit for
-    this time is old; 0: it may repeat. ``seconds``: the loop ends this time after the first frame;
-    0: never. ``scan``: the first estimate is from several looks."""
+    source's, ``correction`` of depths included; ``depth_error``: of depths. ``frozen_s``: an image
+    that repeats bit for bit for this time is old; 0: it may repeat. ``seconds``: the loop ends this
+    time after the first frame; 0: never. ``scan``: the first estimate is from several looks."""
 
     region: RegionConfig = RegionConfig()
     follower: FollowerConfig = FollowerConfig()
     intrinsics: Intrinsics | None = None
     correction: DepthCorrection = DepthCorrection()
+    depth_error: DepthError | None = None
     stale_s: float = 0.5
     give_up_s: float = 60.0
     seconds: float = 0.0
@@ -295,6 +296,9 @@ class Loop:
     def _calibrated(self, seen: Observation) -> Observation | InputError:
         """The frame with the intrinsics and depths that the user calibrated."""
         given, content = self._config.intrinsics, seen.content
+        if (stated := self._config.depth_error) is not None:
+            content = with_depth_error(content, stated)
+            seen = replace(seen, content=content)
         if given is None or not isinstance(content, DepthFrame):
             return seen
         has = content.intrinsics
@@ -310,6 +314,8 @@ class Loop:
                 f"{given.width} x {given.height}; calibrate for the size that is streamed."
             )
         depth_mm = self._config.correction.corrected(content.depth_mm)
+        if stated is not None:
+            given = replace(given, depth_error=stated)
         return replace(seen, content=DepthFrame(depth_mm, given, content.stamp_ns))
 
     def _publish(self, result: TrackingResult, sink_workers: list[SinkWorker]) -> TrackingResult:

@@ -19,7 +19,7 @@ from tumortrack.core.config import check_seed
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import FAR_MM
 from tumortrack.core.process import parallel_map
-from tumortrack.core.types import Anatomy
+from tumortrack.core.types import Anatomy, DepthError
 from tumortrack.models.in_distribution import InDistributionRange, fit_mm, spread_mm
 from tumortrack.registration.config import RegistrationConfig
 from tumortrack.registration.gauss_newton import RegistrationResult, refine
@@ -33,7 +33,6 @@ from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.rest_shape import RestShape, distances_of
 from tumortrack.sense.cloud import thin_cloud
-from tumortrack.sense.noise import CalibrationConfig
 from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
 from tumortrack.simulate.scene_folder import draw_targets
 
@@ -117,7 +116,7 @@ def build_model(
     # A scene a thread: the parts of a search wait for each other.
     fits = parallel_map(located, scenes[: config.searched])
     std_scale, errors = _compared_with_truth(
-        registration, scenes, fits, config.scene.calibration, inner_ct
+        registration, scenes, fits, config.scene.calibration.depth_error, inner_ct
     )
     spreads = [spread_mm(scene.looks.points_mm) for scene in scenes]
     fits_mm = [fit_mm(np.abs(fit.distances_mm)) for fit in fits]
@@ -138,14 +137,15 @@ def _compared_with_truth(
     registration: Registration,
     scenes: list[_Scene],
     fits: list[RegistrationResult],
-    calibration: CalibrationConfig,
+    depth_error: DepthError,
     inner_ct: Float64[np.ndarray, "m 3"],
 ) -> tuple[float, dict[str, float]]:
     """The factor for standard deviations, 1 or more, and how far off the answers were."""
     errors, nearest, ratios = [], [], []
     for scene, fit in zip(scenes, fits, strict=False):
         _, bent = registration.bend(fit)
-        covariance_mm2 = registration.uncertain(bent, calibration).covariance_mm2(inner_ct)
+        share = depth_error.share(bent.motion.centre_mm[2])
+        covariance_mm2 = registration.uncertain(bent, share).covariance_mm2(inner_ct)
         assert covariance_mm2 is not None
         away = bent.motion.carry(inner_ct) - scene.inner_mm
         errors.append(scene.off_mm(bent.motion, inner_ct))

@@ -14,6 +14,7 @@ from jaxtyping import Float, Float32, Int32, Int64, UInt8
 
 from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.evidence import FEWEST_TOUCHES, Evidence
+from tumortrack.core.geometry import largest_std_of
 from tumortrack.core.report import EvidenceReport, FitReport, SizeFit, SmoothingReport
 from tumortrack.core.types import (
     Anatomy,
@@ -30,6 +31,7 @@ from tumortrack.registration import report as entries
 from tumortrack.registration.advice import Advisor, part_number
 from tumortrack.registration.bend import BentFit
 from tumortrack.registration.choose import likeliest
+from tumortrack.registration.depth_scale import depth_share
 from tumortrack.registration.evidence import EvidenceTerms, Known, still_known
 from tumortrack.registration.gauss_newton import RegistrationResult
 from tumortrack.registration.looks import Looks
@@ -78,8 +80,8 @@ class _OrganPoints:
 @dataclass(frozen=True, eq=False)
 class _Placed:
     """The organ before the camera: the library's fit and the bent one, its motion with covariance,
-    the moved surfaces (camera frame), and the covariance (mm^2) at the samples and at the middle of
-    each part's box."""
+    the moved surfaces (camera frame), the covariance (mm^2) at the samples and at the middle of
+    each part's box, and the largest deviations there without the camera's common error."""
 
     fit: RegistrationResult
     bent: BentFit
@@ -87,6 +89,8 @@ class _Placed:
     meshes: dict[str, Mesh]
     sample_mm2: Float[np.ndarray, "k 3 3"]
     middle_mm2: Float[np.ndarray, "parts 3 3"]
+    sample_fit_std_mm: Float[np.ndarray, " k"]
+    middle_fit_std_mm: Float[np.ndarray, " parts"]
     structures: dict[str, Mesh]
 
     @property
@@ -148,7 +152,8 @@ class RegistrationLocator:
         points = self._points(frame, looks, evidence=EvidenceTerms.of(evidence, self._touchable))
         fit = self._registration.register(points, None, frame.stage)
         fit, bent = self._bent(fit, frame)
-        size, placed = self._size(fit), self._checked(fit, bent, frame)
+        size = apparent_size(fit.motion, fit.looks, self._registration.config)
+        placed = self._checked(fit, bent, size, frame)
         organ = placed.meshes[self._model.parts[0]]
         with frame.stage("fine"):
             inside = self._drawn(placed, organ, cloud.stamp_ns, frame.rng)
@@ -177,7 +182,8 @@ class RegistrationLocator:
         found = self._fit_after(last, points, how, frame)
         fit, bent = self._bent(found.fit, frame)
         bent, lag_s = self._smoothed(bent, last, cloud.stamp_ns, how.smoothing_s)
-        size, placed = self._size(fit), self._checked(fit, bent, frame)
+        size = apparent_size(fit.motion, fit.looks, self._registration.config)
+        placed = self._checked(fit, bent, size, frame)
         with frame.stage("carry"):
             inside = self._carry(placed, cloud.stamp_ns)
         smoothing = SmoothingReport(time_s=how.smoothing_s, lag_ms=1000 * lag_s)
@@ -294,7 +300,8 @@ class RegistrationLocator:
         poses = [look.camera_from_look for look in looks[1:]]
         candidates_mm = looks[0].cloud.candidates_mm
         noises = [look.cloud.noise for look in looks if look.cloud.noise is not None]
-        return Looks.of(points_mm, poses, evidence, noises, candidates_mm)
+        error = looks[0].cloud.depth_error
+        return Looks.of(points_mm, poses, evidence, noises, candidates_mm, error)
 
     def warm(self) -> None:
         """See ``tracking.tracker.Tracker.warm``."""
@@ -308,23 +315,25 @@ class RegistrationLocator:
         for surface in range(len(self._touchable)):
             self._shape.field(surface)
 
-    def _size(self, fit: RegistrationResult) -> SizeFit:
-        times, gain = apparent_size(fit.motion, fit.looks, self._registration.config)
-        return SizeFit(times=times, gain=gain)
-
     def _bent(self, fit: RegistrationResult, frame: Frame) -> tuple[RegistrationResult, BentFit]:
         with frame.stage("bend"):
             return self._registration.bend(fit)
 
-    def _checked(self, fit: RegistrationResult, bent: BentFit, frame: Frame) -> _Placed:
+    def _checked(
+        self, fit: RegistrationResult, bent: BentFit, size: SizeFit, frame: Frame
+    ) -> _Placed:
         """The organ as ``bent`` has it, if it can be this organ by the library's fit."""
         self._registration.check(fit, self._model.in_distribution)
         with frame.stage("surfaces"):
-            return self._moved(fit, bent)
+            return self._moved(fit, bent, size)
 
-    def _moved(self, fit: RegistrationResult, bent: BentFit) -> _Placed:
-        calibration = self._model.config.scene.calibration
-        motion = self._registration.uncertain(bent, calibration, self._calibration.std_scale)
+    def _moved(
+        self, fit: RegistrationResult, bent: BentFit, size: SizeFit | None = None
+    ) -> _Placed:
+        share, looks = 0.0, fit.looks
+        if size is not None and len(looks.points_mm):
+            share = depth_share(size, bent.motion.centre_mm[2], looks.depth_error)
+        motion = self._registration.uncertain(bent, 0.0, self._calibration.std_scale)
         anatomy = self._shape.anatomy_ct
         moved = motion.carry(self._vertices_ct)
         ends = np.cumsum([len(mesh.vertices_mm) for mesh in self._surfaces])[:-1]
@@ -332,14 +341,15 @@ class RegistrationLocator:
         there = zip(names, self._surfaces, np.split(moved, ends), strict=True)
         surfaces = {name: mesh.moved(places) for name, mesh, places in there}
         structures = {name: surfaces.pop(name) for name in anatomy.structures}
-        known_mm2 = motion.covariance_mm2(
-            np.concatenate([self._samples_ct, self._shape.middles_ct])
-        )
-        assert known_mm2 is not None
-        count = len(self._samples_ct)
-        return _Placed(
-            fit, bent, motion, surfaces, known_mm2[:count], known_mm2[count:], structures
-        )
+        places_ct = np.concatenate([self._samples_ct, self._shape.middles_ct])
+        fit_mm2 = motion.covariance_mm2(places_ct)
+        assert fit_mm2 is not None
+        motion = replace(motion, depth_share=share)
+        along = share * motion.carry(places_ct)
+        known_mm2 = fit_mm2 + along[:, :, None] * along[:, None, :]
+        std_mm, count = largest_std_of(fit_mm2), len(self._samples_ct)
+        spread = known_mm2[:count], known_mm2[count:], std_mm[:count], std_mm[count:]
+        return _Placed(fit, bent, motion, surfaces, *spread, structures)
 
     def _report(
         self,
@@ -352,10 +362,13 @@ class RegistrationLocator:
     ) -> FitReport:
         fit, bent = placed.fit, placed.bent
         surfaces_mm2 = np.split(placed.sample_mm2, self._sample_ends)
+        on_surface_mm = np.split(placed.sample_fit_std_mm, self._sample_ends)
+        fit_mm = zip(placed.middle_fit_std_mm, map(np.max, on_surface_mm), strict=True)
         held_mm = held_by_prior_mm(placed.motion, bent.prior_slope)
         deviations = {
             name: {
                 "held_by_prior_mm": held,
+                "fit_std_mm": (float(middle_mm), float(surface_mm)),
                 **entries.part_deviations(
                     center_mm2,
                     surface_mm2,
@@ -363,8 +376,8 @@ class RegistrationLocator:
                     fit.looks.points_mm,
                 ),
             }
-            for name, held, center_mm2, surface_mm2 in zip(
-                self._model.parts, held_mm, placed.middle_mm2, surfaces_mm2, strict=True
+            for name, held, (middle_mm, surface_mm), center_mm2, surface_mm2 in zip(
+                self._model.parts, held_mm, fit_mm, placed.middle_mm2, surfaces_mm2, strict=True
             )
         }
         usual_cost, config = self._calibration.usual_cost, self._registration.config

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Float64, Int64
 
 from tumortrack.core.geometry import Affine, Points, rigid, transform_points
 from tumortrack.core.report import LooksReport
-from tumortrack.core.types import PointNoise
+from tumortrack.core.types import DepthError, PointNoise
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.evidence import EvidenceTerms
 from tumortrack.registration.kernels import POSE
@@ -70,6 +70,7 @@ class Looks:
         evidence: what is known beside the points.
         noise: of the points; where looks differ, that of the worst.
         candidates_mm: points of a single look that may be the organ's too.
+        depth_error: of the cameras.
     """
 
     points_mm: Points
@@ -79,6 +80,7 @@ class Looks:
     evidence: EvidenceTerms | None = None
     noise: PointNoise = PointNoise()  # noqa: RUF009 (an immutable tuple)
     candidates_mm: Float[np.ndarray, "c 3"] | None = None
+    depth_error: DepthError | None = None
 
     @classmethod
     def of(
@@ -88,6 +90,7 @@ class Looks:
         evidence: EvidenceTerms | None = None,
         noises: Iterable[PointNoise] = (),
         candidates_mm: Float[np.ndarray, "c 3"] | None = None,
+        depth_error: DepthError | None = None,
     ) -> Looks:
         """Points of each look in its own camera's frame; further ones with where it is."""
         moved = [*points_mm[:1], *map(_moved, camera_from_look, points_mm[1:])]
@@ -98,7 +101,7 @@ class Looks:
         noise = PointNoise()
         if worst:
             noise = PointNoise(*worst)
-        return cls(together, numbers, poses, shifts, evidence, noise, candidates_mm)
+        return cls(together, numbers, poses, shifts, evidence, noise, candidates_mm, depth_error)
 
     @property
     def count(self) -> int:

@@ -15,7 +15,6 @@ from tumortrack.core.process import parallel_for
 from tumortrack.registration import kernels
 from tumortrack.registration.kernels import Flow, Pose
 from tumortrack.registration.rest_shape import RestShape
-from tumortrack.sense.noise import CALIBRATED, CalibrationConfig
 from tumortrack.simulate.elastic.flow import steps_for
 
 Moved = Float64[np.ndarray, "n 3"]
@@ -33,7 +32,7 @@ class ElasticMotion:
             CT's axes, about the centre) and coefficients, once fitted.
         rivals: other motions that explain the points nearly as well, each with its share of the
             probability.
-        calibration: the largest errors of the camera's calibration, which no fit can see.
+        depth_share: standard deviation of the camera's depths, as a share of them, all alike.
         std_scale: a factor for its standard deviations, found on validation scenes.
     """
 
@@ -43,7 +42,7 @@ class ElasticMotion:
     coefficients: Float64[np.ndarray, " m"]
     covariance: Float64[np.ndarray, "p p"] | None = None
     rivals: tuple[tuple[ElasticMotion, float], ...] = ()
-    calibration: CalibrationConfig = CALIBRATED
+    depth_share: float = 0.0
     std_scale: float = 1.0
 
     @property
@@ -87,7 +86,7 @@ class ElasticMotion:
 
     def covariance_mm2(self, points_ct: Points, /) -> Float64[np.ndarray, "n 3 3"] | None:
         """Of the places to which ``carry`` takes points, in the camera's axes: of pose and state to
-        first order, of the rivals and the camera's calibration."""
+        first order, of the rivals and the camera's depths."""
         if self.covariance is None:
             return None
         points = _given(points_ct)
@@ -97,9 +96,9 @@ class ElasticMotion:
         for rival, share in self.rivals:
             away = rival.carry(points) - places_mm
             out += share * away[:, :, None] * away[:, None, :]
-        depth_mm = np.maximum(places_mm[:, 2], 1.0)
-        ray, deep = places_mm / depth_mm[:, None], self.calibration.variance_mm2(depth_mm)
-        return self.std_scale**2 * (out + deep[:, None, None] * ray[:, :, None] * ray[:, None, :])
+        out *= self.std_scale**2
+        along = self.depth_share * places_mm
+        return out + along[:, :, None] * along[:, None, :]
 
     def _spread(
         self, points: Float32[np.ndarray, "n 3"], out: Float64[np.ndarray, "n 3 3"]

@@ -49,7 +49,6 @@ from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.rest_shape import RestShape
 from tumortrack.registration.search import PosePrior, Search, Start, far_from, turned_starts
 from tumortrack.registration.uncertainty import posterior
-from tumortrack.sense.noise import CalibrationConfig
 
 Timer = Callable[[str], AbstractContextManager[object]]
 
@@ -148,14 +147,12 @@ class Registration:
             check_in_distribution(usual, points_mm, distances_mm, registered=True)
         check_likely(fit.motion.rarity)
 
-    def uncertain(
-        self, bent: BentFit, calibration: CalibrationConfig, std_scale: float = 1.0
-    ) -> ElasticMotion:
+    def uncertain(self, bent: BentFit, depth_share: float, std_scale: float = 1.0) -> ElasticMotion:
         """The motion of ``bend`` with its covariance: see ``ElasticMotion``."""
         return replace(
             bent.motion,
             covariance=posterior(bent.motion, bent.looks, self.config),
-            calibration=calibration,
+            depth_share=depth_share,
             std_scale=std_scale,
         )
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64
 
+from tumortrack.core.report import SizeFit
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
 
+_LEAST_KNOWN = 1.0  # of a size: nothing, where rounding leaves less
 _LESS = 0.05  # share of the prior's weight: first order, and no float32 noise
 
 
@@ -36,9 +38,7 @@ def held_by_prior_mm(motion: ElasticMotion, prior_slope: Float64[np.ndarray, " p
     return (np.linalg.norm(away_mm, axis=1) / _LESS).tolist()
 
 
-def apparent_size(
-    motion: ElasticMotion, looks: Looks, config: GaussNewtonConfig
-) -> tuple[float, float]:
+def apparent_size(motion: ElasticMotion, looks: Looks, config: GaussNewtonConfig) -> SizeFit:
     """How large the points show the organ, times its true size, and how much less it would cost to
     fit them scaled about their cameras by that; to second order, as in Rao's score test."""
     assert motion.covariance is not None
@@ -53,4 +53,6 @@ def apparent_size(
     precision, across = near.cameras_precision(motion.covariance)
     cross = near.by_cameras.T @ weighted - across.T @ motion.covariance @ cross
     curvature -= cross @ np.linalg.solve(precision, cross)  # what the cameras' errors take up
-    return float(1 + slope / curvature), float(slope**2 / curvature)
+    curvature = max(curvature, _LEAST_KNOWN)
+    times, gain = float(1 + slope / curvature), float(slope**2 / curvature)
+    return SizeFit(times=times, gain=gain, std=float(curvature**-0.5))

@@ -13,6 +13,7 @@ from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.evidence import read_evidence
 from tumortrack.report.seen import Seen
+from tumortrack.tracking.misses import depths_within_mm
 from tumortrack.tracking.options import LocateOptions, check_grid, model_folder
 from tumortrack.tracking.points import PointTable, check_near_organ, read_points
 from tumortrack.tracking.views import (
@@ -63,13 +64,13 @@ class Located:
         head = {} if self.estimate is None else report_entry(self.estimate)
         return {**head, **self.about}
 
-    def save(self, folder: Path, overwrite: bool = False) -> None:
+    def save(self, folder: str | Path, overwrite: bool = False) -> None:
         """Write the folder that `tumortrack locate` writes. Raises InputError: it exists and
         ``overwrite`` is False; StorageError: the disk refused."""
         from tumortrack.report.run_page import write_run_page
         from tumortrack.tracking import files
 
-        report = self.report
+        report, folder = self.report, Path(folder)
         add = partial(write_run_page, report=report, estimate=self.estimate, seen=self.seen)
         if self.estimate is None:
             files.write_no_estimate(folder, report, overwrite, add)
@@ -121,6 +122,12 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
     if estimate.quality == "poor" and views[0].unit is not None:
         doubt = f"if that is not the organ, or not all of it: {_ASK}; --whole takes all."
         about["notes"].append(doubt)
+    if not options.depth_error and organs[0].depth_error is None and clouds[0] != NO_CLOUD:
+        about["notes"].append(
+            f"depths may be {depths_within_mm(estimate.report):.1f} mm off here (95 %), all alike: "
+            "nobody says how well this camera is calibrated (--depth-error, or depth_left_mm in "
+            "the intrinsics file)."
+        )
     if options.poses is not None and estimate.report.looks is not None:
         about["looks"] = {
             **to_builtins(estimate.report.looks),

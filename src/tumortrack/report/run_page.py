@@ -31,6 +31,7 @@ from tumortrack.report.renderer import Body, ParallelView, corner_normals, rende
 from tumortrack.report.seen import PAGE, Seen, next_evidence, next_lines, part_rows, row_words
 from tumortrack.report.wrapping import wrapped
 from tumortrack.sense.camera import deproject
+from tumortrack.sense.region.working_image import ORGAN, sampled_pixels
 from tumortrack.tracking.margins import margin_words
 from tumortrack.tracking.slices import ORIENTATIONS, outlined, plane_through
 
@@ -274,8 +275,7 @@ def _labelled(estimate: Estimate, places_mm: Float[np.ndarray, "n 3"]) -> UInt8[
 
 def _depth_picture(frame: DepthFrame, taken: UInt8[np.ndarray, "h w"] | None) -> Image.Image:
     """Near is bright, no return is black; what was ``taken`` for the organ has its colour."""
-    every = 1 if taken is None else max(round(frame.depth_mm.shape[0] / taken.shape[0]), 1)
-    depth_mm = frame.depth_mm[::every, ::every]
+    depth_mm = frame.depth_mm if taken is None else frame.depth_mm[sampled_pixels(frame)]
     (height, width), known = depth_mm.shape, np.isfinite(depth_mm)
     grey = np.zeros((height, width))
     if known.any():
@@ -284,7 +284,7 @@ def _depth_picture(frame: DepthFrame, taken: UInt8[np.ndarray, "h w"] | None) ->
         grey[known] = 235 - 190 * share
     picture: np.ndarray = np.repeat(grey[..., None], 3, axis=2)
     if taken is not None:
-        organ = known & (taken[:height, :width] == 0)
+        organ = known & (taken == ORGAN)
         picture[organ] = 0.5 * picture[organ] + 0.5 * np.array(colours.part_colour(1))
     image = Image.fromarray(picture.astype(np.uint8))
     return image.resize((_VIEW_WIDTH, round(_VIEW_WIDTH * image.height / image.width)))

@@ -7,13 +7,14 @@ so the image spans -0.5 .. width - 0.5, as in librealsense.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import replace
+from typing import NamedTuple, overload
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Integer
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.types import DepthFrame, Intrinsics
+from tumortrack.core.types import DepthError, DepthFrame, Intrinsics, SensorCloud
 
 # Depth field of view of the RealSense D405 (depth module D401) at 16:9. The D400 family's
 # datasheet gives 87 x 58 degrees, +-3 degrees from lens to lens.
@@ -95,3 +96,18 @@ def project(
     in_front = np.where(depth_mm > 0, depth_mm, np.nan)
     fx, fy, cx, cy = pinhole_of(intrinsics)
     return points[:, :2] / in_front[:, None] * [fx, fy] + [cx, cy], depth_mm
+
+
+@overload
+def with_depth_error(content: DepthFrame, error: DepthError | None) -> DepthFrame: ...
+@overload
+def with_depth_error(
+    content: DepthFrame | SensorCloud, error: DepthError | None
+) -> DepthFrame | SensorCloud: ...
+def with_depth_error(
+    content: DepthFrame | SensorCloud, error: DepthError | None
+) -> DepthFrame | SensorCloud:
+    """The same, of a camera whose depths err so."""
+    if isinstance(content, DepthFrame):
+        return replace(content, intrinsics=replace(content.intrinsics, depth_error=error))
+    return replace(content, depth_error=error)

@@ -49,14 +49,15 @@ def cloud_from_depth(
         raise _too_few(len(index), frame, config.near_mm, config.far_mm)
     chosen = rng.choice(index, min(len(index), config.n_points), replace=False)
     points_mm = deproject_pixels(chosen, depth_mm[chosen].astype(np.float64), frame.intrinsics)
-    return SensorCloud(points_mm, frame.stamp_ns)
+    error = frame.intrinsics.depth_error
+    return SensorCloud(points_mm, frame.stamp_ns, depth_error=error)
 
 
 def thin_cloud(cloud: SensorCloud, n_points: int, rng: np.random.Generator) -> SensorCloud:
     """``n_points`` distinct random points of the cloud (all of them if it has no more)."""
     count = len(cloud.points_mm)
     chosen = rng.choice(count, min(count, n_points), replace=False)
-    return SensorCloud(cloud.points_mm[chosen], cloud.stamp_ns)
+    return _points_of(cloud, chosen)
 
 
 def crop_cloud(cloud: SensorCloud, near_mm: float, far_mm: float) -> SensorCloud:
@@ -67,7 +68,12 @@ def crop_cloud(cloud: SensorCloud, near_mm: float, far_mm: float) -> SensorCloud
     inside = (z > near_mm) & (z < far_mm)
     if inside.sum() < FEWEST_POINTS:
         raise _too_few(int(inside.sum()), cloud, near_mm, far_mm)
-    return SensorCloud(cloud.points_mm[inside], cloud.stamp_ns)
+    return _points_of(cloud, inside)
+
+
+def _points_of(cloud: SensorCloud, chosen: np.ndarray) -> SensorCloud:
+    points_mm = cloud.points_mm[chosen]
+    return SensorCloud(points_mm, cloud.stamp_ns, depth_error=cloud.depth_error)
 
 
 def seen_points(

@@ -22,7 +22,7 @@ from tumortrack.core.errors import InputError, readable
 from tumortrack.core.geometry import Affine, read_rigid
 from tumortrack.core.packages import to_install
 from tumortrack.core.store import read_file, read_json
-from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
+from tumortrack.core.types import DepthError, DepthFrame, Intrinsics, SensorCloud
 from tumortrack.sense.camera import plausible
 from tumortrack.sense.cloud import seen_points
 from tumortrack.sense.ply import parse_ply_properties
@@ -31,6 +31,8 @@ from tumortrack.sense.units import depths_mm
 _CLOUD_SHAPES = "n x 3, n x 6 or (of floats) h x w x 3"
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy")  # an array may be either
 DEPTH_UNIT_MM = 0.1  # the D405's default
+_LEFT_KEY, MOST_LEFT_MM = "depth_left_mm", 20.0
+CALIBRATED_MM = 1.0  # where a calibration does not state what it leaves (assumed)
 LARGEST_FILE = 256 * 2**20  # bytes, also of what a compressed file unpacks to
 _PINHOLE_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 _OTHER_KEYS = {"cx": "ppx", "cy": "ppy"}
@@ -264,8 +266,26 @@ def _camera(path: Path) -> tuple[Intrinsics, dict[str, Any]]:
     for key in ("width", "height"):
         if not values[key].is_integer():
             raise InputError(f"{path}: {key} is {values[key]}; it must be a whole number.")
-    camera = Intrinsics(int(values.pop("width")), int(values.pop("height")), **values)
+    camera = Intrinsics(
+        width=int(values["width"]),
+        height=int(values["height"]),
+        fx=values["fx"],
+        fy=values["fy"],
+        cx=values["cx"],
+        cy=values["cy"],
+        depth_error=_depth_error(data, path),
+    )
     return plausible(camera, str(path)), data
+
+
+def _depth_error(data: dict[str, Any], path: Path) -> DepthError | None:
+    """What a calibration leaves; None: the file states no calibration."""
+    if not data.keys() & {_LEFT_KEY, "depth_scale", "depth_offset_mm"}:
+        return None
+    left_mm = _numbers(data.get(_LEFT_KEY, CALIBRATED_MM), _LEFT_KEY, path)[0]
+    if not 0 <= left_mm <= MOST_LEFT_MM:
+        raise InputError(f"{path}: {_LEFT_KEY} is {left_mm}; allowed: 0 to {MOST_LEFT_MM:g} mm.")
+    return DepthError(left_mm)
 
 
 def _numbers(value: object, key: str, path: Path) -> list[float]:
@@ -282,7 +302,10 @@ def _numbers(value: object, key: str, path: Path) -> list[float]:
 def intrinsics_json(intrinsics: Intrinsics) -> dict[str, Any]:
     """Content of intrinsics.json beside a depth.png: the pinhole and the mm per step of depth."""
     values = {key: getattr(intrinsics, key) for key in _PINHOLE_KEYS}
-    return {**values, "depth_unit_mm": DEPTH_UNIT_MM}
+    stated: dict[str, Any] = {**values, "depth_unit_mm": DEPTH_UNIT_MM}
+    if intrinsics.depth_error is not None and not intrinsics.depth_error.scale:
+        stated[_LEFT_KEY] = intrinsics.depth_error.offset_mm
+    return stated
 
 
 def read_depth_png(path: Path, intrinsics_path: Path) -> DepthFrame:

@@ -23,6 +23,7 @@ _LENGTHS_PX = np.geomspace(1.0, 15.0, 13)  # that are tried, up to half a window
 _MOST_WINDOWS = 400  # a hundredth of the noise is then known; 10 ms
 _FEWEST = 12
 _ROUGH = 4.0  # times the median variance: an edge, a fold, a window with an outlier
+_EDGES = 8.0  # times an image's decile: nine tenths of its windows may have such
 _NEIGHBOURS, _SPARSE_MM = 40, 3.0
 _WIDER = 4.0  # times the noise: the radius within which neighbours lie
 _STEP_OFF, _LEAST_STEP_MM = 0.02, 1e-3  # of a step, and of one: rounding of stored numbers
@@ -100,7 +101,7 @@ def image_noise(frame: DepthFrame) -> DepthNoise | None:
         return None
     residuals = windows - (windows @ (basis := _quadratics(side))) @ basis.T
     variances = np.mean(residuals**2, axis=1)
-    smooth = variances <= _ROUGH * np.median(variances)
+    smooth = variances <= _EDGES * np.quantile(variances, 0.1)
     seen = _semivariogram(residuals[smooth].reshape(-1, side, side))
     white_mm, correlated_mm, length_px = _parts(seen, side)
     at_mm = float(np.median(windows[smooth].mean(1)))
@@ -191,7 +192,7 @@ def _windows(depth_mm: np.ndarray, side: int) -> Float[np.ndarray, "n pixels"]:
     rows, columns = np.nonzero(whole)
     drawn = np.linspace(0, len(rows) - 1, min(len(rows), _MOST_WINDOWS)).astype(int)
     chosen = view[every * rows[drawn], every * columns[drawn]]
-    return chosen.reshape(len(drawn), -1).astype(float)
+    return chosen.reshape(len(drawn), side * side).astype(float)
 
 
 @lru_cache(maxsize=32)

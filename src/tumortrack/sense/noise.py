@@ -16,11 +16,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from jaxtyping import Float
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
-from tumortrack.core.types import DepthFrame
+from tumortrack.core.types import DepthError, DepthFrame
 from tumortrack.sense.camera import pinhole_of
 
 if TYPE_CHECKING:
@@ -41,9 +40,9 @@ class CalibrationConfig(Config, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         self.check_ranges("calibration", offset_mm=20.0, scale=0.2)
 
-    def variance_mm2(self, depth_mm: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Variance of these errors at depths, along the line of sight."""
-        return (self.offset_mm**2 + (self.scale * depth_mm) ** 2) / 3
+    @property
+    def depth_error(self) -> DepthError:
+        return DepthError(self.offset_mm, self.scale)
 
 
 CALIBRATED = CalibrationConfig()
@@ -117,6 +116,11 @@ class NoiseConfig(Config, frozen=True, kw_only=True):
     def nearest_mm(self) -> float:
         """Nothing nearer is seen."""
         return 0.0
+
+    @property
+    def depth_error(self) -> DepthError | None:
+        """Beside noise; None: the camera is not calibrated."""
+        return DepthError()
 
     def measured(self, frame: DepthFrame, seed: int) -> DepthFrame:
         """The frame with these errors; each part hashes its own stream from the seed."""

@@ -16,7 +16,8 @@ from jaxtyping import Float32
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.tables import read_table
-from tumortrack.core.types import DepthFrame
+from tumortrack.core.types import DepthError, DepthFrame
+from tumortrack.sense.files import MOST_LEFT_MM
 from tumortrack.sense.noise import SENSORS, NoiseConfig
 
 Grade = Literal["measured", "second-hand", "vendor", "computed", "assumed"]
@@ -91,6 +92,10 @@ class SensorConfig(NoiseConfig, frozen=True, kw_only=True):
         scale, offset, warp = rng.uniform(-1, 1, 3) * (not self.calibrated)
         deep_mm = rng.uniform(*self.tissue_mm) * self.tissue
         return scale * self.scale, offset * self.offset_mm + deep_mm, warp * self.warp_mm
+
+    @property
+    def depth_error(self) -> DepthError | None:
+        return DepthError() if self.calibrated and not self.bias[1] else None
 
     def measured(self, frame: DepthFrame, seed: int) -> DepthFrame:
         shape, depth_mm = frame.depth_mm.shape, frame.depth_mm
@@ -195,3 +200,23 @@ def simulated(
     figures = {key: value for key, (value, _, _) in FIGURES[name].items()}
     options = {"unit": unit, "calibrated": not uncalibrated, "tissue": tissue}
     return msgspec.convert({**figures, **options}, SensorConfig)
+
+
+def depth_error_of(stated: str) -> DepthError | None:
+    """``--depth-error``: of a calibrated camera, mm; or a camera's kind, which nobody calibrated:
+    its published bias, with what tissue adds. Raises InputError: it is neither."""
+    if not stated:
+        return None
+    if stated in FIGURES:
+        camera = SensorConfig(**{key: value for key, (value, _, _) in FIGURES[stated].items()})
+        return DepthError(camera.offset_mm + camera.warp_mm + camera.tissue_mm[1], camera.scale)
+    try:
+        left_mm = float(stated)
+    except ValueError:
+        left_mm = -1.0
+    if not 0 <= left_mm <= MOST_LEFT_MM:
+        raise InputError(
+            f"--depth-error {stated} is not understood. Allowed: 0 to {MOST_LEFT_MM:g} (mm that "
+            f"the camera's calibration leaves), or a camera: {', '.join(FIGURES)}."
+        )
+    return DepthError(left_mm)

@@ -8,6 +8,8 @@ with few neighbours are dropped first (Rusu et al. 2008, doi 10.1016/j.robot.200
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float32
 
@@ -80,7 +82,7 @@ def clean_cloud(cloud: SensorCloud) -> SensorCloud:
     kept = noise.of_points(len(cloud.points_mm))
     if noise.white_mm > _NOISY_MM and not noise.bound:
         cloud, kept = _smoothed(cloud, noise)
-    return SensorCloud(cloud.points_mm, cloud.stamp_ns, kept)
+    return replace(cloud, noise=kept)
 
 
 def _without_scattered(cloud: SensorCloud, share: float) -> SensorCloud:
@@ -90,7 +92,7 @@ def _without_scattered(cloud: SensorCloud, share: float) -> SensorCloud:
     for _ in range(2):  # a stray's neighbours may be strays
         reach_mm = cKDTree(points_mm).query(points_mm, CROWD + 1)[0][:, -1]
         points_mm = points_mm[reach_mm < LONELY * np.quantile(reach_mm, 0.5 * (1 - share))]
-    return SensorCloud(points_mm, cloud.stamp_ns)
+    return replace(cloud, points_mm=points_mm)
 
 
 def _smoothed(cloud: SensorCloud, noise: DepthNoise) -> tuple[SensorCloud, PointNoise]:
@@ -109,7 +111,7 @@ def _smoothed(cloud: SensorCloud, noise: DepthNoise) -> tuple[SensorCloud, Point
     white_mm = noise.white_mm * np.sqrt(TERMS / 2 / count)
     mean_mm = noise.white_mm / np.sqrt(len(points_mm))
     left = PointNoise(noise.white_mm, float(white_mm), float(mean_mm))
-    return SensorCloud((drawn + off_mm).astype(np.float32), cloud.stamp_ns), left
+    return replace(cloud, points_mm=(drawn + off_mm).astype(np.float32)), left
 
 
 @njit(nogil=True)

@@ -20,10 +20,16 @@ from tumortrack.core.config import Config, check_seed
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.geometry import rigid, rotation_onto, transform_points
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
-from tumortrack.sense.camera import d405, project
+from tumortrack.sense.camera import d405, project, with_depth_error
 from tumortrack.sense.cloud import FEWEST_POINTS, CloudConfig, cloud_from_depth
 from tumortrack.sense.clutter import ClutterConfig, add_clutter
-from tumortrack.sense.noise import CalibrationConfig, NoiseConfig, add_noise, miscalibrate
+from tumortrack.sense.noise import (
+    CALIBRATED,
+    CalibrationConfig,
+    NoiseConfig,
+    add_noise,
+    miscalibrate,
+)
 from tumortrack.sense.occlusion import OcclusionConfig, occlude
 from tumortrack.sense.render import Visibility, render_depth
 from tumortrack.simulate.deform import ChainConfig, DragConfig, installed, links_of
@@ -184,6 +190,8 @@ class Simulator:
             frame = occlude(frame, config.occlusion, rng)  # hides background too
             frame = miscalibrate(frame, config.calibration, rng)
             frame = add_noise(frame, config.noise, rng)
+            if config.calibration == CALIBRATED:
+                frame = with_depth_error(frame, config.noise.depth_error)
             try:
                 cloud = cloud_from_depth(frame, self._crop(free, rng), rng)
             except NoEstimate:  # the crop left too few points: another draw of the same recipe

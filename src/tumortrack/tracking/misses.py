@@ -25,6 +25,7 @@ _NAME = "misses.json"
 POOR_MM = 6.0
 _MOST_STRAYS, _FARTHEST_RIVAL_MM = 0.3, 10.0  # more say no more
 _LEAST_HELD_MM = 0.05  # nor does less
+_WITHIN = 1.96  # standard deviations: 95 % of a normal distribution
 
 
 class MissModel(Config, frozen=True):
@@ -51,14 +52,14 @@ def shipped() -> MissModel:
 def figures(report: FitReport, name: str) -> dict[str, float] | None:
     """Of a tumor; larger is worse. None: the method does not know them."""
     part, cost, motion = report.parts[name], report.fit_cost, report.motion
-    if cost is None or motion is None or part.center_axes_std_mm is None:
+    if cost is None or motion is None or part.fit_std_mm is None:
         return None
-    if part.surface_std_mm is None or part.nearest_mm is None or part.held_by_prior_mm is None:
+    if part.nearest_mm is None or part.held_by_prior_mm is None:
         return None
     apart_mm = max((rival.apart_mm[name] for rival in cost.others), default=0.0)
     return {
-        "center_std": math.log(part.center_axes_std_mm[0]),
-        "surface_std": math.log(part.surface_std_mm),
+        "center_std": math.log(part.fit_std_mm[0]),
+        "surface_std": math.log(part.fit_std_mm[1]),
         "nearest": math.log(max(part.nearest_mm, 1.0)),
         "prior": math.log(max(part.held_by_prior_mm, _LEAST_HELD_MM)),
         "cost": math.log(max(cost.now / cost.usual, 0.1)),
@@ -71,10 +72,17 @@ def figures(report: FitReport, name: str) -> dict[str, float] | None:
     }
 
 
+def depths_within_mm(report: FitReport) -> float:
+    """How far off the camera's depths are at most, all alike, where the organ is (95 %)."""
+    return 0.0 if report.motion is None else _WITHIN * report.motion.depth_std_mm
+
+
 def with_misses(report: FitReport) -> FitReport:
-    """The report with ``miss_mm`` of its tumors, where the method knows enough."""
-    parts = dict(report.parts)
+    """The report with ``miss_mm`` of its tumors, where the method knows enough: what was learned,
+    and what the camera's depths err by beside that."""
+    parts, depth_mm = dict(report.parts), depths_within_mm(report)
     for name, part in report.tumors.items():
         if (known := figures(report, name)) is not None:
-            parts[name] = msgspec.structs.replace(part, miss_mm=shipped().radius_mm(known))
+            miss_mm = math.hypot(shipped().radius_mm(known), depth_mm)
+            parts[name] = msgspec.structs.replace(part, miss_mm=miss_mm)
     return msgspec.structs.replace(report, parts=parts)

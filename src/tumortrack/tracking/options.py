@@ -56,11 +56,15 @@ class RegionOptions(PatientOptions):
         range: keep depths between NEAR and FAR mm (default: the range of the model's scenes).
         box: keep what is in a box: two opposite corners X Y Z X Y Z, camera frame, mm.
         whole: take everything in range and box for the organ, without searching for it.
+        depth_error: how far off depths may be, all alike: MM that the camera's calibration leaves,
+            or the kind of a camera that nobody calibrated (d405-measured, d435, zed, ...). Default:
+            depth_left_mm of the intrinsics; else that of most cameras.
     """
 
     range: tuple[float, float] | None = None
     box: tuple[float, float, float, float, float, float] | None = None
     whole: bool = False
+    depth_error: str = ""
 
     def region(self, model: Model) -> RegionConfig:
         """Raises InputError: an invalid range or box."""

@@ -18,7 +18,7 @@ from tumortrack.models.in_distribution import FIT_FACTOR, RIVAL_COST
 from tumortrack.sense.noise import CAMERA_STD
 from tumortrack.sense.render import render_depth
 from tumortrack.tracking.margins import ModelMargins, exceeded, figures, margins_with, stated_margin
-from tumortrack.tracking.misses import POOR_MM, with_misses
+from tumortrack.tracking.misses import POOR_MM, depths_within_mm, with_misses
 
 # Where ``miss_mm`` is not known: largest standard deviation of a tumor's centre, and largest
 # distance to it in another fit that is nearly as likely.
@@ -29,6 +29,8 @@ _MAX_UNCERTAINTY_MM = 3.0
 _LIMITS = 0.05, 0.09  # doubtful, impossible
 # Without a motion surfaces are rougher: with centres 2 to 8 mm off, 0.09 to 0.15 are usual.
 _ROUGH_LIMITS = 0.1, 0.2
+_ON = 1 / 3  # of what is behind: on the surface
+_AGAINST = 3.0  # pixels that a pixel that is seen through outweighs
 _WIDTH = 212  # pixels of the depth image in which the organ is compared
 # The doubt about an earlier estimate stays if less than this share of what was in sight then is in
 # sight now, unless the organ moved by more than this from one frame to the next.
@@ -194,7 +196,12 @@ def _doubt(report: FitReport) -> Finding | None:
     digits = _telling(miss_mm, POOR_MM)
     values: dict[str, float | str] = {"part": name, "miss_mm": miss_mm, "limit_mm": POOR_MM}
     values["digits"] = digits
-    return Finding("miss", values) if miss_mm > POOR_MM else None
+    if not miss_mm > POOR_MM:
+        return None
+    depth_mm = depths_within_mm(report)
+    if 2 * depth_mm**2 > miss_mm**2:  # most of it
+        return Finding("depths", {"depth_mm": depth_mm})
+    return Finding("miss", values)
 
 
 def _contradiction(evidence: Sequence[EvidenceReport]) -> Finding | None:
@@ -264,12 +271,7 @@ def seen_through(
        organ reaches beyond the true one, and is seen through if something can be seen there.
     3. Where nothing hides the organ.
     """
-    every = max(1, round(frame.intrinsics.width / _WIDTH))
-    seen_mm = frame.depth_mm[::every, ::every]
-    full = frame.intrinsics
-    scaled = (number / every for number in (full.fx, full.fy, full.cx, full.cy))
-    reduced = Intrinsics(*seen_mm.shape[::-1], *scaled)
-    organ_mm = render_depth(organ.vertices_mm, organ.faces, reduced).depth_mm
+    seen_mm, organ_mm = _compared(organ, frame)
     image = np.isfinite(organ_mm)
     both = image & np.isfinite(seen_mm)
     if not both.any():
@@ -279,6 +281,25 @@ def seen_through(
     rim_share = (seen_mm[rim] > organ_mm[image].min()).sum() / max(rim.sum(), 1)
     through = (seen_mm[both] > organ_mm[both] + behind_mm).mean()
     return float(through), float(rim_share), float(in_sight)
+
+
+def explained(organ: Mesh, frame: DepthFrame, look: Look) -> float:
+    """Log-likelihood of an image with the organ there, but for a constant and a factor: each pixel
+    that shows its surface speaks for it, each that shows what it would hide against it."""
+    seen_mm, organ_mm = _compared(organ, frame)
+    off_mm, behind_mm = seen_mm - organ_mm, _behind_mm(look)  # NaN where one shows nothing
+    on, through = np.abs(off_mm) < _ON * behind_mm, off_mm > behind_mm
+    return float(on.sum() - _AGAINST * through.sum())
+
+
+def _compared(organ: Mesh, frame: DepthFrame) -> tuple[np.ndarray, np.ndarray]:
+    """Depths that were seen, and the organ's, in a smaller image."""
+    every = max(1, round(frame.intrinsics.width / _WIDTH))
+    seen_mm = frame.depth_mm[::every, ::every]
+    full = frame.intrinsics
+    scaled = (number / every for number in (full.fx, full.fy, full.cx, full.cy))
+    reduced = Intrinsics(*seen_mm.shape[::-1], *scaled)
+    return seen_mm, render_depth(organ.vertices_mm, organ.faces, reduced).depth_mm
 
 
 def cloud_shares(

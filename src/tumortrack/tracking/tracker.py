@@ -35,6 +35,7 @@ from tumortrack.tracking.causes import likely_causes, words
 from tumortrack.tracking.disputes import Disputes
 from tumortrack.tracking.margins import stated_margin
 from tumortrack.tracking.model_files import case_model
+from tumortrack.tracking.pieces import likeliest_piece
 from tumortrack.tracking.quality import doubt_if_hidden, judged, with_margin
 
 _DEFAULTS = FollowOptions()
@@ -109,13 +110,17 @@ class Tracker:
                 f"locate takes a SensorCloud, not {type(cloud).__name__}: read_cloud(FILE), or "
                 "SensorCloud(points_mm) of an n x 3 array in the camera frame."
             )
+        looks: Sequence[Look]
         looks, pieces = _parted(cloud, seen, evidence)
         if not len(cloud.points_mm) and pieces:
             places_mm, pieces = touched(pieces, self.model.parts[0])
             looks = (Look(replace(cloud, points_mm=places_mm), cloud, HERE),)
+
+        def located(looks: Sequence[Look]) -> Estimate:
+            return self._judged(self._locator.locate(looks, grid, seed, pieces), looks, False)
+
         with self._explaining_errors(looks, _DEFAULTS, bool(pieces)):
-            estimate = self._locator.locate(looks, grid, seed, pieces)
-            estimate = self._judged(estimate, looks, False)
+            estimate, looks = likeliest_piece(looks, located)
         return self._explained(estimate, looks, _DEFAULTS)
 
     def follow(
@@ -131,12 +136,16 @@ class Tracker:
         Models that know no motion cannot smooth. Raises as ``locate``."""
         # A fit that is suddenly worse may be to another object.
         strictly = how.either_side if last is None else last.quality != "good" or not _unusual(last)
+        looks: Sequence[Look]
         looks, pieces = _parted(cloud, seen, evidence)
         if pieces:
             how = msgspec.structs.replace(how, evidence=(*how.evidence, *pieces))
+
+        def located(looks: Sequence[Look]) -> Estimate:
+            return self._judged(self._locator.follow(looks, last, how), looks, strictly, last)
+
         with self._explaining_errors(looks, how, bool(pieces or (last and last.evidence))):
-            estimate = self._locator.follow(looks, last, how)
-            estimate = self._judged(estimate, looks, strictly, last)
+            estimate, looks = likeliest_piece(looks, located)
         return self._explained(estimate, looks, how)
 
     def _judged(

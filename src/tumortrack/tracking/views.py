@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from tumortrack.registration.gauss_newton import FARTHEST
 from tumortrack.registration.looks import kernel_width_mm, lies_on
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion, seen_from_first
-from tumortrack.sense.camera import deproject_pixels
+from tumortrack.sense.camera import deproject_pixels, with_depth_error
 from tumortrack.sense.cloud import check_cloud, check_depth_unit, crop_cloud
 from tumortrack.sense.files import (
     CLOUD_SUFFIXES,
@@ -33,10 +33,12 @@ from tumortrack.sense.files import (
 from tumortrack.sense.measured_noise import noise_of
 from tumortrack.sense.region import Hints, organ_points
 from tumortrack.sense.region.working_image import ORGAN, PIECES, STEPS, THIN, image_of_frame
+from tumortrack.sense.sensors import depth_error_of
 from tumortrack.tracking.options import LocateOptions
 
 NO_CLOUD = Path("-")
 _NEAR = 3  # pixels from the one of --at
+_MOSTLY = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,10 +97,15 @@ class View:
         """The organ in a depth image once it is fitted: other pieces that lie on it are its own."""
         if found.taken is None or not isinstance(self.content, DepthFrame):
             return found
-        beside = np.flatnonzero(np.isin(found.taken, (THIN, PIECES)))
-        points_mm = image_of_frame(self.content, None).points(beside)
-        taken = found.taken.copy()
-        taken.ravel()[beside[lies_on(motion, points_mm, within_mm)]] = ORGAN
+        beside = np.flatnonzero(np.isin(found.taken, (ORGAN, THIN, PIECES)))
+        on = lies_on(motion, image_of_frame(self.content, None).points(beside), within_mm)
+        taken, was = found.taken.copy(), found.taken.ravel()[beside] == ORGAN
+        if on[was].mean() < _MOSTLY:  # it was found in another piece
+            taken.ravel()[beside] = PIECES
+            clouds = (found.cloud, *found.cloud.others)
+            on_each = [lies_on(motion, cloud.points_mm, within_mm).mean() for cloud in clouds]
+            found = found._replace(cloud=clouds[int(np.argmax(on_each))])
+        taken.ravel()[beside[on]] = ORGAN
         return found.with_pixels(taken)
 
     def _cropped(
@@ -158,7 +165,11 @@ def read_views(paths: Sequence[Path], options: LocateOptions) -> list[View]:
             "it once, or once for each."
         )
     cameras = cameras if len(cameras) == count else cameras * count
-    return [_read_view(*pair, options) for pair in zip(paths, cameras, strict=True)]
+    stated = depth_error_of(options.depth_error)
+    views = [_read_view(*pair, options) for pair in zip(paths, cameras, strict=True)]
+    if stated is None:
+        return views
+    return [replace(view, content=with_depth_error(view.content, stated)) for view in views]
 
 
 def _read_view(path: Path, intrinsics: Path | None, options: LocateOptions) -> View:

@@ -141,11 +141,13 @@ def _scale(
 
 
 def correction(said: dict[str, Any]) -> dict[str, float]:
-    """What intrinsics.json says of it: true = depth_scale * measured + depth_offset_mm."""
+    """What intrinsics.json says of it: true = depth_scale * measured + depth_offset_mm, right to
+    depth_left_mm."""
+    left = {"depth_left_mm": said["left_mm"]}
     if not said["corrected"]:
-        return {}
+        return left
     per = 1 / (1 + said["scale"])
-    return {"depth_scale": per, "depth_offset_mm": -said["offset_mm"] * per}
+    return {"depth_scale": per, "depth_offset_mm": -said["offset_mm"] * per, **left}
 
 
 def _row(found: list[PlaneErrors], low_mm: float, width: int) -> dict[str, Any] | None:

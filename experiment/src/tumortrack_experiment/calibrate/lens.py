@@ -196,7 +196,8 @@ def _fit(
         _, matrix, bent, _, _, std, _, errors = cv2.calibrateCameraExtended(
             points, pixels, size, np.zeros((3, 3)), np.zeros(5), flags=_MODELS[model]
         )
-        camera = Intrinsics(*size, *map(float, matrix[[0, 1, 0, 1], [0, 1, 2, 2]]))
+        fx, fy, cx, cy = map(float, matrix[[0, 1, 0, 1], [0, 1, 2, 2]])
+        camera = Intrinsics(*size, fx, fy, cx, cy)
         plausible(camera, "these pictures")
     except (cv2.error, InputError) as error:
         raise InputError(

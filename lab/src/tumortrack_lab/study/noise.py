@@ -13,13 +13,13 @@ from jaxtyping import Float
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import rigid, transform_points
-from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud
+from tumortrack.core.types import Anatomy, DepthError, DepthFrame, SensorCloud
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.report.rivals import best_rigid_pose, rigid_fit
-from tumortrack.sense.camera import d405, deproject
+from tumortrack.sense.camera import d405, deproject, with_depth_error
 from tumortrack.sense.region import Hints, organ_points
 from tumortrack.sense.render import render_depth
-from tumortrack.sense.sensors import FIGURES, SensorConfig, simulated
+from tumortrack.sense.sensors import FIGURES, SensorConfig, depth_error_of, simulated
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack.tracking.tracker import Tracker, region_for
 from tumortrack_lab.twin.apparatus import moved
@@ -28,7 +28,9 @@ CLOUDS = "cloud", "strays", "fat"
 _POINTS = 3000  # of a cloud, from all pixels of the organ
 _WIDER = 1.5  # the box of strays than the organ's
 _LUMP_MM = 14.0  # radius of a lump of fat at the organ's outline
-_PARTS = "white", "correlated", *CLOUDS
+BIASES = {"scale": "%", "depth": "mm"}
+_PARTS = "white", "correlated", *BIASES, *CLOUDS
+_UNCALIBRATED = "uncalibrated-"
 
 
 @dataclass(frozen=True)
@@ -36,26 +38,32 @@ class Condition:
     """``kind``: white, correlated, cloud (mm of white noise), strays or fat (% of the points), or a
     camera of ``sense.sensors``; ``amount``: mm, %, or so many times a camera's noise (0: its edges,
     holes and steps alone); ``length_px``: where the correlation is 1/e; ``distance_mm``: the median
-    of the organ's depths."""
+    of the organ's depths. Calibrated, and stated, but ``scale`` (%) and ``depth`` (mm), by which
+    depths err to either side, and ``uncalibrated`` cameras, of which the kind is said."""
 
     kind: str
     amount: float = 0.0
     distance_mm: float = 150.0
     length_px: float = 0.0
+    uncalibrated: bool = False
 
     @classmethod
     def read(cls, text: str) -> Condition:
-        """``white:1``, ``correlated:1:8`` (mm, px), ``strays:20``, ``zed@400`` (mm), ``zed:0@400``.
-        Raises InputError: it is none of these."""
-        what, _, distance = text.partition("@")
+        """``white:1``, ``correlated:1:8`` (mm, px), ``strays:20``, ``scale:3``, ``zed@400`` (mm),
+        ``zed:0@400``, ``uncalibrated-zed@400``. Raises InputError: it is none of these."""
+        camera = text.removeprefix(_UNCALIBRATED)
+        what, _, distance = camera.partition("@")
         kind, *numbers = what.split(":")
         try:
             amount, length_px = [*map(float, numbers), 0.0, 0.0][:2] if numbers else (1.0, 0.0)
-            condition = cls(kind, amount, float(distance or 150.0), length_px)
+            at_mm, raw = float(distance or 150.0), camera != text
+            condition = cls(kind, amount, at_mm, length_px, raw)
         except ValueError as error:
             raise InputError(f"{text} is no condition: {error}.") from error
         allowed, given = (*_PARTS, *FIGURES), (amount, length_px, condition.distance_mm)
-        if kind not in allowed or not all(0 <= value < np.inf for value in given):
+        if kind not in (FIGURES if camera != text else allowed) or not all(
+            0 <= value < np.inf for value in given
+        ):
             raise InputError(
                 f"{text} is no condition. Allowed: {', '.join(allowed)}, with positive "
                 "numbers: white:1, correlated:1:8, zed@400."
@@ -68,14 +76,17 @@ class Condition:
         if self.kind == "white" and not self.amount:
             return "none"
         if self.kind not in _PARTS:
-            return self.kind if self.amount == 1 else f"{self.kind}, noise times {self.amount:g}"
+            kind = f"{self.kind}, uncalibrated" if self.uncalibrated else self.kind
+            return kind if self.amount == 1 else f"{kind}, noise times {self.amount:g}"
+        if self.kind in BIASES:
+            return f"depths off by {self.amount:g} {BIASES[self.kind]}"
         across = f", {self.length_px:g} px" if self.length_px else ""
         return f"{self.kind} {self.amount:g} {'%' if self.kind in CLOUDS[1:] else 'mm'}{across}"
 
     def sensor(self, unit: int) -> SensorConfig:
         """What disturbs an image of it; ``unit``: which camera of its kind."""
         if self.kind not in _PARTS:
-            camera = simulated(self.kind, unit=unit)
+            camera = simulated(self.kind, unit=unit, uncalibrated=self.uncalibrated)
             assert isinstance(camera, SensorConfig)
             px, mm = ("temporal_px", "frozen_px"), ("temporal_mm", "frozen_mm")
             scaled: dict[str, Any] = {key: self.amount * getattr(camera, key) for key in px}
@@ -85,7 +96,7 @@ class Condition:
         white = self.kind == "white"
         return SensorConfig(
             native_px=d405().width,
-            temporal_mm=(0.0 if self.kind in CLOUDS else self.amount,),
+            temporal_mm=(self.amount if self.kind in ("white", "correlated") else 0.0,),
             white_share=float(white),
             temporal_length_px=self.length_px or 1.0,
         )
@@ -93,7 +104,7 @@ class Condition:
     @property
     def noise_mm(self) -> float:
         """Standard deviation of one depth at this distance, its random and frozen parts."""
-        if self.kind in CLOUDS:
+        if self.kind in (*CLOUDS, *BIASES):
             return self.amount if self.kind == "cloud" else 0.0
         return float(np.hypot(*self.sensor(0).noise_mm(self.distance_mm)))
 
@@ -111,8 +122,14 @@ def placed(reference: Anatomy, distance_mm: float) -> tuple[Anatomy, DepthFrame]
 
 def disturbed(frame: DepthFrame, condition: Condition, seed: int) -> DepthFrame | SensorCloud:
     """What is seen instead of a clean image."""
+    if condition.kind in BIASES:
+        off = condition.amount if seed % 2 else -condition.amount
+        by = (1 + off / 100, 0.0) if condition.kind == "scale" else (1.0, off)
+        return frame.with_depth(frame.depth_mm * np.float32(by[0]) + np.float32(by[1]))
     if condition.kind not in CLOUDS:
-        return condition.sensor(seed).measured(frame, seed)
+        camera = condition.sensor(seed)
+        error = depth_error_of(condition.kind) if condition.uncalibrated else camera.depth_error
+        return with_depth_error(camera.measured(frame, seed), error)
     rng, points = np.random.default_rng((seed, 1)), deproject(frame).astype(float)
     points = rng.choice(points, min(_POINTS, len(points)), replace=False)
     count = round(len(points) * condition.amount / 100)
@@ -123,7 +140,7 @@ def disturbed(frame: DepthFrame, condition: Condition, seed: int) -> DepthFrame 
         points[:count] = (low + high) / 2 + _WIDER * (rng.random((count, 3)) - 0.5) * (high - low)
     else:
         points = np.concatenate([points, _lump(points, count, rng)])
-    return SensorCloud(points.astype(np.float32))
+    return SensorCloud(points.astype(np.float32), depth_error=DepthError())
 
 
 def _lump(

@@ -6,14 +6,15 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.report import Finding
-from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.core.types import DepthError, DepthFrame, SensorCloud
 from tumortrack.sense.cloud import FEWEST_POINTS
 from tumortrack.sense.measured_noise import DepthNoise, image_noise
 from tumortrack.sense.noise import REFERENCE_MM
@@ -37,6 +38,7 @@ from tumortrack.sense.units import unit_advice
 
 __all__ = ["Hints", "Region", "RegionConfig", "organ_points"]
 
+_OTHER_DEPTH = 1.15  # times: noise that grows with its square is another by a third
 _MOST_CANDIDATES = 3000  # points beside the organ's: an organ of which a quarter was found
 
 
@@ -68,8 +70,7 @@ def organ_points(
     content: DepthFrame | SensorCloud, config: RegionConfig, hints: Hints, rng: np.random.Generator
 ) -> Region:
     """Crop by range, region of interest, mask and last estimate; remove other tissue by colour, the
-    background plane and flying pixels; choose one connected piece, and what continues it behind an
-    occluder.
+    background plane and flying pixels; choose one connected piece.
 
     Of large images only every second (third ...) pixel is used. The same generator gives the same
     points.
@@ -79,16 +80,7 @@ def organ_points(
         InputError: mask or picture is not of the image's size, or a mask was given with a cloud.
     """
     start = time.perf_counter()
-    noise = None
-    if isinstance(content, DepthFrame):
-        noise = hints.noise or image_noise(content)
-        image = image_of_frame(content, hints.mask, noise)
-        if noise is not None:
-            config = _as_noisy(config, noise, image.window_px)
-    elif hints.mask is None:
-        image = image_of_cloud(content)
-    else:
-        raise InputError("a mask goes with a depth image; for a cloud give box_mm instead.")
+    image, noise, config = _image_of(content, config, hints)
     near, far = config.crop.near_mm, config.crop.far_mm
     keep_inside(image, np.array([[-np.inf, -np.inf, near], [np.inf, np.inf, far]]), RANGE)
     if config.box_mm is not None:
@@ -102,12 +94,18 @@ def organ_points(
     if config.flying:
         remove_flying(image, config)
     possible = image.remaining(image.taken)
+    others: list[np.ndarray] = []
     if config.pieces:
         window, part = image.cropped()
-        choose_pieces(part, config, hints)
+        others = [
+            np.flatnonzero(_in_window(image, window, mask))
+            for mask in choose_pieces(part, config, hints)
+        ]
         image.taken[window] = part.taken
     counts = image.counts()
     remaining = image.remaining(image.taken)
+    if noise is not None and hints.noise is None and isinstance(content, DepthFrame):
+        noise = _noise_there(content, image, remaining, noise)
     if len(remaining) < FEWEST_POINTS:
         steps = ", ".join(f"{name} {n}" for name, n in counts.items() if n and name != "organ")
         advice = "move the camera until the organ is in view and in range, or say where it is"
@@ -122,18 +120,88 @@ def organ_points(
             "doubt": doubt and f" Also, {doubt}.",
         }
         raise NoEstimate(Finding("few_points", values))
-    drawn = rng.choice(remaining, min(len(remaining), config.crop.n_points), replace=False)
-    beside = possible[np.isin(possible, remaining, assume_unique=True, invert=True)]
-    most = min(round(len(beside) * len(drawn) / len(remaining)), _MOST_CANDIDATES)
-    beside = rng.choice(beside, most, replace=False)
-    pixels = counts["organ"] * image.step_px**2
-    cloud = SensorCloud(
-        image.points(drawn),
-        content.stamp_ns,
-        None if noise is None else noise.of_points(pixels, image.window_px),
-        image.points(beside),
-    )
+
+    def cloud_of(pixels: np.ndarray) -> SensorCloud:
+        drawn = rng.choice(pixels, min(len(pixels), config.crop.n_points), replace=False)
+        beside = possible[np.isin(possible, pixels, assume_unique=True, invert=True)]
+        most = min(round(len(beside) * len(drawn) / len(pixels)), _MOST_CANDIDATES)
+        beside = rng.choice(beside, most, replace=False)
+        count = len(pixels) * image.step_px**2
+        return SensorCloud(
+            image.points(drawn),
+            content.stamp_ns,
+            None if noise is None else noise.of_points(count, image.window_px),
+            image.points(beside),
+            _depth_error(content),
+        )
+
+    cloud = cloud_of(remaining)
+    more = [cloud_of(pixels) for pixels in others if len(pixels) >= FEWEST_POINTS]
+    cloud = replace(cloud, others=tuple(more))
     return Region(cloud, counts, image.taken, time.perf_counter() - start, doubt, noise)
+
+
+def _image_of(
+    content: DepthFrame | SensorCloud, config: RegionConfig, hints: Hints
+) -> tuple[WorkingImage, DepthNoise | None, RegionConfig]:
+    """What the steps work on, the noise of a depth image, and the configuration with it."""
+    if isinstance(content, SensorCloud):
+        if hints.mask is not None:
+            raise InputError("a mask goes with a depth image; for a cloud give box_mm instead.")
+        return image_of_cloud(content), None, config
+    noise = hints.noise or _noise_in_reach(content, config, hints)
+    image = image_of_frame(content, hints.mask, noise)
+    if noise is not None:
+        config = _as_noisy(config, noise, image.window_px)
+    return image, noise, config
+
+
+def _noise_in_reach(frame: DepthFrame, config: RegionConfig, hints: Hints) -> DepthNoise | None:
+    """Measured where the organ can be; if nothing there is smooth, in the whole image."""
+    near_mm, far_mm = config.crop.near_mm, config.crop.far_mm
+    if hints.last_box_mm is not None:
+        near_mm = max(near_mm, float(hints.last_box_mm[0][2]) - config.last_margin_mm)
+        far_mm = min(far_mm, float(hints.last_box_mm[1][2]) + config.last_margin_mm)
+    there = (frame.depth_mm > near_mm) & (frame.depth_mm < far_mm)
+    if hints.mask is not None and hints.mask.shape == there.shape:
+        there &= hints.mask
+    return _noise_where(frame, there) or image_noise(frame)
+
+
+def _noise_there(
+    frame: DepthFrame, image: WorkingImage, organ: np.ndarray, noise: DepthNoise
+) -> DepthNoise:
+    """The noise; measured once more, on the organ, if that lies at another depth: how noise grows
+    with depth differs from camera to camera."""
+    if not len(organ):
+        return noise
+    times = float(np.median(image.depth_mm.ravel()[organ])) / noise.depth_mm
+    if 1 / _OTHER_DEPTH < times < _OTHER_DEPTH:
+        return noise
+    rows, columns = np.divmod(organ, image.depth_mm.shape[1])
+    (height, width), step = frame.depth_mm.shape, image.step_px
+    there = np.zeros((height, width), bool)
+    for down in range(step):
+        for right in range(step):
+            row = np.minimum(rows * step + down, height - 1)
+            there[row, np.minimum(columns * step + right, width - 1)] = True
+    return _noise_where(frame, there) or noise
+
+
+def _noise_where(frame: DepthFrame, there: np.ndarray) -> DepthNoise | None:
+    return image_noise(frame.with_depth(np.where(there, frame.depth_mm, np.float32(np.nan))))
+
+
+def _depth_error(content: DepthFrame | SensorCloud) -> DepthError | None:
+    return (
+        content.intrinsics.depth_error if isinstance(content, DepthFrame) else content.depth_error
+    )
+
+
+def _in_window(image: WorkingImage, window: Any, mask: np.ndarray) -> np.ndarray:
+    whole = np.zeros(image.taken.shape, bool)
+    whole[window] = mask
+    return whole
 
 
 def _as_noisy(config: RegionConfig, noise: DepthNoise, window_px: int) -> RegionConfig:

@@ -1,6 +1,5 @@
-"""Join pieces that continue each other behind an occluder, and choose the organ's: the one that the
-user picked, that the last estimate points to, or the likeliest; and what lies wholly in the last
-estimate's box."""
+"""Choose the organ's piece: the one that the user picked, that the last estimate points to, or the
+likeliest; and what lies wholly in the last estimate's box."""
 
 from __future__ import annotations
 
@@ -10,7 +9,6 @@ import numpy as np
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.report import Finding
-from tumortrack.sense.region.gaps import lines_across_gaps
 from tumortrack.sense.region.hints import Hints
 from tumortrack.sense.region.pieces import find_edges, find_pieces
 from tumortrack.sense.region.working_image import (
@@ -22,12 +20,12 @@ from tumortrack.sense.region.working_image import (
     jit,
 )
 
-_OPENINGS = (1.0, 1.7, 2.8)  # times ``opening_mm``: the last is wider than fingers
+# Whether folds are edges, and the opening, times ``opening_mm``: the last is wider than fingers.
+_SPLITS = (False, 1.0), (True, 1.0), (True, 1.7), (True, 2.8)
 _CLEARLY = 1.1  # a wider opening must raise the score by this factor
 _PICK_REACH_MM = 10.0  # from the picked point to its piece
+_OTHERS, _LEAST_OTHER = 3, 0.1  # pieces that may be it instead; score over the best of them
 _SAME_MM = 5.0  # largest step in depth between neighbouring pixels of one surface
-_FEWEST_LINES = 0.4  # length along which pieces continue each other, over the smaller one's size
-_IN_A_ROW = 4  # gaps between the first and the last piece of an organ
 _CUT = 0.1  # ``_Sizes.cut`` from which a piece leaves the image
 _POOR = 0.5  # likeness of an organ below which a guess is doubtful
 _WHOLLY = 0.97  # share of a piece in the last box from which it is part of the organ
@@ -38,23 +36,24 @@ _AIMED = 0.4  # at this angle (tangent) from the optical axis a piece is half as
 _THICK = 0.8  # of an organ's shortest extent: thinner pieces are likely fingers or shafts
 
 
-def choose_pieces(image: WorkingImage, config: RegionConfig, hints: Hints) -> None:
-    """Join pieces behind occluders, and remove all but the organ's piece and what belongs to it.
-    Raises NoEstimate: no piece lies within 10 mm of the picked point.
+def choose_pieces(image: WorkingImage, config: RegionConfig, hints: Hints) -> list[np.ndarray]:
+    """Remove all but the organ's piece and what belongs to it.
+    Returns the masks of the next likeliest pieces, unless hints say which one it is. Raises
+    NoEstimate: no piece lies within 10 mm of the picked point.
 
-    A hand that touches the organ makes one large piece with it that leaves the image. Then the
-    opening is widened until fingers are too narrow to connect.
+    Surroundings level with the organ, or a hand that touches it, make one large piece with it that
+    leaves the image. Then folds part the two; then the opening is widened until fingers are too
+    narrow to connect.
     """
-    edges = find_edges(image, config)
     best: tuple[float, np.ndarray, _Sizes, np.ndarray] | None = None
-    for wider in _OPENINGS:
+    edges = find_edges(image, config, folds=False)
+    for folds, wider in _SPLITS:
+        if folds and wider == 1:
+            edges = find_edges(image, config, folds)
         pieces, count = find_pieces(image, edges, config, wider)
         sizes = _measure(image.depth_mm, edges[1], image.taken, pieces, image.pinhole, count)
-        numbers = _joined(image, pieces, sizes, config)
-        if numbers.max() < count:
-            pieces, count = numbers[pieces], int(numbers.max())
-            sizes = _measure(image.depth_mm, edges[1], image.taken, pieces, image.pinhole, count)
-        chosen, score, doubtful = _chosen(image, pieces, sizes, config, hints)
+        poor = _POOR if folds else 1.0  # beside something large a fold may hide the organ in it
+        chosen, score, doubtful = _chosen(image, pieces, sizes, config, hints, poor)
         if best is None or score > _CLEARLY * best[0]:
             best = score, pieces, sizes, chosen
         if not doubtful:
@@ -71,6 +70,11 @@ def choose_pieces(image: WorkingImage, config: RegionConfig, hints: Hints) -> No
         parts = (area > _WHOLLY * sizes.area_mm2) & (sizes.thick_mm > _THICK_PART_MM) & (area > 0)
         chosen = chosen | parts
     image.remove(~chosen[pieces], PIECES)
+    if hints.picked_mm is not None or hints.last_box_mm is not None:
+        return []
+    scores = np.where(chosen, 0.0, sizes.area_mm2 * _like_an_organ(sizes, config))
+    likely = np.argsort(-scores)[:_OTHERS]
+    return [pieces == n for n in likely if scores[n] > _LEAST_OTHER * scores.max()]
 
 
 class _Sizes(NamedTuple):
@@ -89,35 +93,19 @@ class _Sizes(NamedTuple):
     aside: np.ndarray
 
 
-def _joined(
-    image: WorkingImage, pieces: np.ndarray, sizes: _Sizes, config: RegionConfig
-) -> np.ndarray:
-    """New numbers (count + 1,) of all pieces, int32: the same for those that continue each other
-    behind occluders, directly or by way of others, and in pairs are no wider than an organ. Nothing
-    that leaves the image, as arms do, is joined."""
-    # What looks like an organ itself hides nothing: bed or drape go on behind the organ, too.
-    hides = _like_an_organ(sizes, config) < _POOR
-    lines_mm = lines_across_gaps(image, pieces, hides, config.gap_mm)
-    smaller_mm2 = np.minimum(sizes.area_mm2, sizes.area_mm2[:, None])
-    low_mm = np.minimum(sizes.low_mm, sizes.low_mm[:, None])
-    high_mm = np.maximum(sizes.high_mm, sizes.high_mm[:, None])
-    inside = sizes.cut <= _CUT
-    joined = lines_mm > _FEWEST_LINES * np.sqrt(smaller_mm2)
-    joined &= ((high_mm - low_mm).max(-1) <= config.organ_mm[1]) & inside & inside[:, None]
-    if not joined.any():
-        return np.arange(len(hides), dtype=np.int32)
-    np.fill_diagonal(joined, True)
-    joined = np.linalg.matrix_power(joined.astype(float), _IN_A_ROW) > 0
-    return np.unique(joined.argmax(1), return_inverse=True)[1].astype(np.int32)
-
-
 def _chosen(
-    image: WorkingImage, pieces: np.ndarray, sizes: _Sizes, config: RegionConfig, hints: Hints
+    image: WorkingImage,
+    pieces: np.ndarray,
+    sizes: _Sizes,
+    config: RegionConfig,
+    hints: Hints,
+    poor: float,
 ) -> tuple[np.ndarray, float, bool]:
     """Which piece (count + 1,) of one split of the image is the organ: the one that the hints
     select, else the likeliest (the largest of an organ's size; what leaves the image counts less,
-    as arms do). Its score; and whether it is doubtful, so that a wider opening may split the image
-    better: it leaves the image or is too wide."""
+    as arms do). Its score; and whether it is doubtful, so that another split may be better: it
+    leaves the image, is too wide, or less like an organ than ``poor`` beside something larger that
+    leaves the image."""
     likeness = _like_an_organ(sizes, config)
     chosen = np.zeros(len(sizes.cut), bool)
     piece = _hinted(image, pieces, sizes, hints)
@@ -133,7 +121,7 @@ def _chosen(
     too_wide = sizes.wide_mm[piece] > config.organ_mm[1]
     # A poor guess beside something larger that leaves the image: a hand that holds the organ?
     larger = sizes.area_mm2[leaves].max(initial=0) > score
-    held = guessed and likeness[piece] < _POOR and larger
+    held = guessed and likeness[piece] < poor and larger
     return chosen, float(score), bool(leaves[piece] or too_wide or held)
 
 

@@ -1,8 +1,9 @@
 """Split the image into connected pieces at depth jumps, creases and narrow places.
 
-A pixel is an edge where a neighbour is missing, lies at another depth, or where the surface folds
-into a valley. Pixels farther than ``opening_mm`` from every edge are the cores of pieces. Cores
-grow by little more than what the opening took away, and never across a jump.
+A pixel is an edge where a neighbour is missing, lies at another depth, or, if that is asked for,
+where the surface folds into a valley. Pixels farther than ``opening_mm`` from every edge are the
+cores of pieces. Cores grow by little more than what the opening took away, and never across a
+jump.
 """
 
 from __future__ import annotations
@@ -38,12 +39,14 @@ def remove_flying(image: WorkingImage, config: RegionConfig) -> None:
     image.remove(_isolated(image.depth_mm, image.taken, _jump(image, config)), FLYING)
 
 
-def find_edges(image: WorkingImage, config: RegionConfig) -> tuple[np.ndarray, np.ndarray]:
+def find_edges(
+    image: WorkingImage, config: RegionConfig, folds: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """The remaining depths (h, w), mm, with short holes bridged, NaN otherwise; and the distance
-    (h, w) of every pixel to the nearest edge, px."""
+    (h, w) of every pixel to the nearest edge, px. ``folds``: are edges, too."""
     jump = _jump(image, config)
     depth_mm = _without_holes(image.depth_mm, image.taken, jump)
-    crease = (config.crease_mm, _CREASE_REACH_MM / image.footprint)
+    crease = (config.crease_mm * folds, _CREASE_REACH_MM / image.footprint)
     return depth_mm, _edge_distance(depth_mm, jump, crease)
 
 

@@ -43,12 +43,11 @@ class RegionConfig(Config, frozen=True, kw_only=True):
     plane_mm: largest tolerance of the plane: how uneven a drape may be.
     plane_share: at least this share of all points must lie on it.
     flying: remove flying pixels, which have few neighbours at their depth.
-    pieces: choose one connected piece; zero ``opening_mm`` and ``gap_mm`` leave it as it is.
+    pieces: choose one connected piece; zero ``opening_mm`` leaves it as it is.
     opening_mm: what is narrower than twice this is no piece and connects none: shafts, the strip
         where a finger touches.
-    crease_mm: a valley deeper than this over 4 mm to either side separates two pieces; zero: never.
-    gap_mm: pieces that continue each other behind an occluder up to this wide are one: an organ
-        behind a shaft or two fingers.
+    crease_mm: a valley deeper than this over 4 mm to either side separates two pieces, if nothing
+        is like an organ otherwise; zero: never.
     steepest_degrees: neighbouring pixels are separated if their depths differ by more than noise
         and a surface tilted by this much explain.
     noise_mm: standard deviation of depth at 150 mm; grows with z^2.
@@ -65,7 +64,6 @@ class RegionConfig(Config, frozen=True, kw_only=True):
     pieces: bool = True
     opening_mm: float = 3.0
     crease_mm: float = 1.2
-    gap_mm: float = 60.0
     steepest_degrees: float = 75.0
     noise_mm: float = 0.2
     organ_mm: tuple[float, float] = (30.0, 160.0)
@@ -78,7 +76,6 @@ class RegionConfig(Config, frozen=True, kw_only=True):
             plane_share=1,
             opening_mm=20,
             crease_mm=20,
-            gap_mm=100,
             steepest_degrees=89,
             noise_mm=10,
         )

@@ -1,0 +1,59 @@
+"""Which piece of an image is the organ: the one in which it is found."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from tumortrack.core.errors import NotThisOrgan
+from tumortrack.core.estimate import Estimate
+from tumortrack.core.types import DepthFrame, Look
+from tumortrack.tracking.misses import POOR_MM
+from tumortrack.tracking.quality import explained
+
+_UNDETERMINED = 2.0  # times the radius that makes an answer poor
+_ELSEWHERE = "fit", "strays", "seen_through", "size"  # checks that speak for another piece
+
+
+def likeliest_piece(
+    looks: Sequence[Look], located: Callable[[Sequence[Look]], Estimate]
+) -> tuple[Estimate, Sequence[Look]]:
+    """The estimate in the first look's points or, where these are not the organ, in another piece
+    of its image (``SensorCloud.others``); and the looks with that piece. ``located``: finds and
+    judges it. Raises NotThisOrgan: none is the organ."""
+    found: list[tuple[Estimate, Sequence[Look]]] = []
+    first: NotThisOrgan | None = None
+    for cloud in (looks[0].cloud, *looks[0].cloud.others):
+        tried = (replace(looks[0], cloud=cloud), *looks[1:])
+        try:
+            estimate = located(tried)
+        except NotThisOrgan as error:
+            first = first or error
+            continue
+        found.append((estimate, tried))
+        if not _doubted(estimate) and (len(found) == 1 or _sure(estimate)):
+            break
+    if first is not None and not found:
+        raise first
+    return found[0] if len(found) == 1 else max(found, key=_likelihood)
+
+
+def _doubted(estimate: Estimate) -> bool:
+    return estimate.finding is not None and estimate.finding.check in _ELSEWHERE
+
+
+def _sure(estimate: Estimate) -> bool:
+    """Whether nothing speaks for another piece, and the tumors' places are determined."""
+    misses_mm = [part.miss_mm or 0.0 for part in estimate.report.tumors.values()]
+    return not _doubted(estimate) and max(misses_mm, default=0.0) < _UNDETERMINED * POOR_MM
+
+
+def _likelihood(found: tuple[Estimate, Sequence[Look]]) -> tuple[bool, float]:
+    """Whether it is sure; and of the image with the organ there. Of a cloud the points that do not
+    stray are counted."""
+    (estimate, looks), seen = found, found[1][0].seen
+    if isinstance(seen, DepthFrame):
+        return _sure(estimate), explained(estimate.organ_mesh, seen, looks[0])
+    cost = estimate.report.fit_cost
+    strays = 0.0 if cost is None else cost.strays
+    return _sure(estimate), len(looks[0].cloud.points_mm) * (1 - strays)
