@@ -444,8 +444,36 @@ def test_touches_alone_are_an_answer(slim_model, tmp_path):
     found_mm = np.array(report["parts"]["tumor_1"]["center_mm"])
     assert np.linalg.norm(found_mm - at_all(TUMOR).mean(0)) < 3
     file.write_bytes(evidence_json(tuple(evidence[:11])))
-    assert "at least 12 touches" in refusal(tumortrack(*command, "--overwrite"))
+    assert "at least 12 places on kidney" in refusal(tumortrack(*command, "--overwrite"))
     assert "give --evidence" in refusal(tumortrack(*command[:-2], "--overwrite"))
+
+
+def planes(count, noise_mm=0.3, **more):
+    """The organ's border in parallel images across it, as ultrasound shows it."""
+    rng = np.random.default_rng(4)
+    along = MOVED[:, 0]
+    ends = np.linspace(*np.quantile(along, (0.05, 0.95)), count)
+    near = (np.flatnonzero(np.abs(along - end) < 1.5) for end in ends)
+    return [
+        Outline(places_mm=tuple(map(tuple, MOVED[mine] + rng.normal(0, noise_mm, (len(mine), 3)))),
+                part="kidney", **more)
+        for mine in near
+    ]  # fmt: skip
+
+
+def test_outlines_alone_are_an_answer_and_their_stated_error_counts(slim_model):
+    tracker, nothing = Tracker(load_model(slim_model, "cpu")), SensorCloud(np.zeros((0, 3)))
+    stds = {}
+    for std_mm, shared_mm in ((0.3, 0.0), (3.0, 0.0), (0.3, 3.0)):
+        told = planes(12, std_mm=std_mm, shared_std_mm=shared_mm, tool="probe")
+        found = tracker.locate(nothing, 16, 0, evidence=[*told, *this_way_round()])
+        tumor = found.report.parts["tumor_1"]
+        off_mm = np.linalg.norm(np.array(tumor.center_mm) - at_all(TUMOR).mean(0))
+        assert off_mm < 2
+        assert found.report.motion.depth_std_mm == 0  # no camera
+        stds[std_mm, shared_mm] = tumor.center_std_mm
+    assert stds[3.0, 0.0] > 1.2 * stds[0.3, 0.0]
+    assert stds[0.3, 3.0] > 2 * stds[0.3, 0.0]
 
 
 def test_what_is_older_than_the_organs_last_motion_is_refused(tmp_path):

@@ -10,7 +10,6 @@ from typing import Any, TypeAlias
 
 import msgspec
 import numpy as np
-from jaxtyping import Float64
 
 from tumortrack.core import store
 from tumortrack.core.config import Config, from_builtins
@@ -18,6 +17,7 @@ from tumortrack.core.csv_tables import number_in, read_rows, whole_in
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points
 from tumortrack.core.report import Point
+from tumortrack.core.types import DepthError, PointNoise, SensorCloud
 
 _REACH_MM = 2000.0  # of anything that a camera above a patient sees
 _LEAST_MM = 3.0  # no camera has an organ nearer
@@ -220,23 +220,32 @@ def _cells(row: dict[str, str], where: str) -> dict[str, Any]:
     }
 
 
-def touched(
-    evidence: Sequence[Evidence], organ: str
-) -> tuple[Float64[np.ndarray, "n 3"], tuple[Evidence, ...]]:
-    """Where the organ's surface was touched (camera frame, mm), and the rest. A tip's radius is
-    taken off towards the middle of all touches. Raises InputError: there are too few."""
-    mine = [each for each in evidence if isinstance(each, Touch) and each.part in ("", organ)]
-    if len(mine) < FEWEST_TOUCHES:
+def touched(evidence: Sequence[Evidence], organ: str) -> tuple[SensorCloud, tuple[Evidence, ...]]:
+    """Where the organ's surface was touched or outlined, as a cloud that no camera saw, with the
+    noise that is stated; and the rest. A tip's radius is taken off towards the middle of all
+    places. Raises InputError: there are too few."""
+    mine = [each for each in evidence
+            if isinstance(each, Touch | Outline) and each.part in ("", organ)]  # fmt: skip
+    counts = [len(each.places) for each in mine]
+    if (count := sum(counts)) < FEWEST_TOUCHES:
         raise InputError(
-            f"without a cloud at least {FEWEST_TOUCHES} touches of {organ} are needed, all over "
-            f"what can be reached of it; there are {len(mine)}."
+            f"without a cloud at least {FEWEST_TOUCHES} places on {organ}, touched or outlined, "
+            f"are needed, all over what can be reached of it; there are {count}."
         )
-    places_mm = np.array([each.place_mm for each in mine])
+    places_mm = np.concatenate([np.array(each.places) for each in mine])
+    tips_mm = np.repeat([each.tip_mm if isinstance(each, Touch) else 0.0 for each in mine], counts)
     inwards = places_mm.mean(0) - places_mm
-    tips_mm = np.array([[each.tip_mm] for each in mine])
     lengths_mm = np.linalg.norm(inwards, axis=1, keepdims=True)
-    places_mm += tips_mm * inwards / np.where(lengths_mm > 0, lengths_mm, 1.0)
-    return places_mm, tuple(each for each in evidence if each not in mine)
+    places_mm += tips_mm[:, None] * inwards / np.where(lengths_mm > 0, lengths_mm, 1.0)
+    shared = dict[str, float]()  # of each tool's shift in the mean of all places
+    for number, (each, places) in enumerate(zip(mine, counts, strict=True)):
+        tool = each.tool or f"piece {number}"
+        shared[tool] = shared.get(tool, 0.0) + each.shared_std_mm * places / count
+    std_mm = float(np.sqrt(np.average([each.std_mm**2 for each in mine], weights=counts)))
+    mean_mm = float(np.linalg.norm([std_mm / count**0.5, *shared.values()]))
+    noise = PointNoise(std_mm, std_mm, mean_mm)
+    cloud = SensorCloud(places_mm.astype(np.float32), noise=noise, depth_error=DepthError())
+    return cloud, tuple(each for each in evidence if each not in mine)
 
 
 def evidence_json(evidence: tuple[Evidence, ...]) -> bytes:

@@ -96,7 +96,7 @@ class Tracker:
             seen: all that the camera saw, by which the estimate is judged; default: the cloud.
             evidence: what else is known of where it lies then: each ``Look`` from another place,
                 ``Touch``, ``Landmark``, ``Held``, ``Outline``, ``Free``, in the frame of ``cloud``,
-                which may be empty: then of twelve touches or more.
+                which may be empty: then of twelve places or more, touched or outlined.
 
         Raises:
             NoEstimate: too few points, no organ found in them, not the organ of this model, or the
@@ -113,8 +113,8 @@ class Tracker:
         looks: Sequence[Look]
         looks, pieces = _parted(cloud, seen, evidence)
         if not len(cloud.points_mm) and pieces:
-            places_mm, pieces = touched(pieces, self.model.parts[0])
-            looks = (Look(replace(cloud, points_mm=places_mm), cloud, HERE),)
+            alone, pieces = touched(pieces, self.model.parts[0])
+            looks = (Look(replace(alone, stamp_ns=cloud.stamp_ns), cloud, HERE),)
 
         def located(looks: Sequence[Look]) -> Estimate:
             return self._judged(self._locator.locate(looks, grid, seed, pieces), looks, False)

@@ -175,7 +175,7 @@ def read_views(paths: Sequence[Path], options: LocateOptions) -> list[View]:
 def _read_view(path: Path, intrinsics: Path | None, options: LocateOptions) -> View:
     if path == NO_CLOUD:
         if options.evidence is None:
-            raise InputError("without a cloud (-) give --evidence FILE with touches.")
+            raise InputError("without a cloud (-) give --evidence FILE with touches or outlines.")
         return View(path, SensorCloud(np.zeros((0, 3), np.float32)))
     suffix = path.suffix.lower()
     if suffix in DEPTH_SUFFIXES and (suffix not in CLOUD_SUFFIXES or intrinsics is not None):
