@@ -586,10 +586,10 @@ def test_status_says_why_and_no_old_numbers():
     assert "3.2 s" in stale.stage()
     sure = small_update()
     assert sure.estimate is not None
-    stated = reporting(sure.estimate, parts={"tumor_1": {"center_std_mm": 1.84}})
+    stated = reporting(sure.estimate, parts={"tumor_1": {"miss_mm": 1.84}})
     sure = replace(sure, estimate=stated)
     good = StatusPanel("good", sure, 0.1, 8, parts=PARTS).numbers()
-    assert "standard deviation of place" in good
+    assert "off by at most (95 %)" in good
     assert "tumor 1</td><td>0.9 ml</td><td>1.8 mm</td>" in good
     assert "0.75" not in good  # a probability of points, which reads as certainty
     doubtful = StatusPanel("poor", replace(sure, quality="poor"), 0.1, 8, parts=PARTS).numbers()

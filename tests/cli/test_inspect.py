@@ -23,7 +23,7 @@ from tumortrack.sense.ply import write_cloud_ply
 PATIENT = {"id": "P1", "side": "left"}
 PARTS = {
     "kidney": {"label": 1, "found": True, "volume_ml": 180.06, "center_mm": [1.0, -2.04, 150.0],
-               "center_std_mm": 0.84},
+               "miss_mm": 2.84},
     "tumor_1": {"label": 2, "found": False},
 }  # fmt: skip
 RUN = {
@@ -67,7 +67,7 @@ def say(path: Path) -> str:
                "kidney: centre (1.0, -2.0, 150.0) mm, 180.1 ml", "tumor_1: not found",
                "a poor estimate has no margin")),
         ({**RUN, "quality": {"verdict": "good", "reason": ""}},
-         ("verdict: good", "kidney: centre (1.0, -2.0, 150.0) mm, standard deviation 0.8 mm")),
+         ("verdict: good", "kidney: centre (1.0, -2.0, 150.0) mm, off by at most 2.8 mm (95 %)")),
         ({"quality": {"verdict": "none", "reason": "only 3 points are left"}, "input": []},
          ("a report of `locate`", "verdict: none", "because only 3 points are left")),
         (TRACK, ("200 updates in 10.0 s, 20.0 a second: 75% good, 15% poor, 10% none",

@@ -89,8 +89,8 @@ def test_the_organ_is_found_in_a_raw_depth_image(raw, clinic_model, phantom_case
     assert "://" not in page
     assert f"<h1>{report['quality']['verdict'].upper()}</h1>" in page
     assert "No margin: the model was not calibrated" in page
-    assert report["quality"]["verdict"] == "good"  # a poor one's deviation would not be shown
-    assert f"{report['parts']['tumor_1']['center_std_mm']:.1f} mm" in page
+    assert report["quality"]["verdict"] == "good"  # a poor one's bound would not be shown
+    assert f"{report['parts']['tumor_1']['miss_mm']:.1f} mm" in page
     with Image.open(raw / "run" / PICTURE) as picture:
         assert picture.width == 2200
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from reports import reporting
-from tumortrack.core.types import SensorCloud
+from tumortrack.core.types import DepthError, SensorCloud
 from tumortrack.models.report import estimate_of
 from tumortrack.tracking import misses, quality
 from tumortrack.tracking.fingerprint import fingerprint
@@ -52,15 +53,19 @@ def test_an_answer_says_how_far_off_its_tumors_may_be(estimate):
     organ, tumor = (estimate.report.parts[name] for name in ("kidney", "tumor_1"))
     assert organ.miss_mm is None
     known = figures(estimate.report, "tumor_1")
-    assert tumor.miss_mm == pytest.approx(shipped().radius_mm(known))
+    depth_mm = 1.96 * estimate.report.motion.depth_std_mm
+    assert depth_mm > 1
+    assert tumor.miss_mm == pytest.approx(math.hypot(shipped().radius_mm(known), depth_mm))
     nearest_mm = np.linalg.norm(visible().points_mm - tumor.center_mm, axis=1).min()
     assert tumor.nearest_mm == pytest.approx(nearest_mm, abs=1.0)  # of the points that are fitted
     assert known["nearest"] == pytest.approx(math.log(tumor.nearest_mm))
 
 
 def test_a_miss_that_may_be_large_makes_an_answer_poor(slim_model, monkeypatch):
-    tracker, cloud = Tracker(load_model(slim_model, "cpu")), visible()
-    for radius_mm, kind in ((POOR_MM - 0.1, None), (POOR_MM + 0.1, "miss")):
+    tracker = Tracker(load_model(slim_model, "cpu"))
+    cases = (POOR_MM - 0.1, 0.0, None), (POOR_MM + 0.1, 0.0, "miss"), (2.0, 10.0, "depths")
+    for radius_mm, depth_mm, kind in cases:
+        cloud = replace(visible(), depth_error=DepthError(depth_mm))
         model = MissModel(fingerprint(), math.log(radius_mm), {}, {})
         monkeypatch.setattr(misses, "shipped", lambda model=model: model)
         found = tracker.locate(cloud, 16, 0).finding

@@ -124,12 +124,9 @@ class PartReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     miss_mm: float | None = None
 
     @property
-    def deviation_words(self) -> str | None:
-        """How sure its place is, for people; None: not known."""
-        if self.center_std_mm is None:
-            return None
-        within = "" if self.miss_mm is None else f" (95 % within {self.miss_mm:.1f} mm)"
-        return f"{self.center_std_mm:.1f} mm{within}"
+    def bound_words(self) -> str:
+        """Within how far of where it is shown its centre lies (95 %); empty: not known."""
+        return "" if self.miss_mm is None else f"{self.miss_mm:.1f} mm"
 
 
 class Residuals(_Value, frozen=True, kw_only=True):
@@ -170,7 +167,7 @@ class SizeFit(_Value, frozen=True, kw_only=True):
 
     times: float
     gain: float
-    std: float
+    std: float = 0.0  # not stated by runs of before
 
 
 class SmoothingReport(_Value, frozen=True, kw_only=True):
@@ -250,7 +247,7 @@ class MotionReport(_Value, frozen=True, kw_only=True):
     rarity: float
     steps: int
     compliance_std_mm: float | None
-    depth_std_mm: float
+    depth_std_mm: float = 0.0  # not stated by runs of before
 
 
 class StatedMargin(_Value, frozen=True, kw_only=True):

@@ -45,7 +45,7 @@ _MOST_TUMORS = 6  # with slices
 _NEAR_MM = 1.0  # points this near to a slice are shown in it
 _BAR_MM = 20.0
 _TITLES = {"good": "GOOD", "poor": "POOR", "none": "NONE: no estimate"}
-_TABLE_TITLES = {"part": "", "centre": "centre (x, y, z)", "std": "1 standard deviation"}
+_TABLE_TITLES = {"part": "", "centre": "centre (x, y, z)", "bound": "off by at most (95 %)"}
 Panel = tuple[str, Image.Image]  # with its caption
 
 

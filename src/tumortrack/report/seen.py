@@ -38,16 +38,16 @@ class Seen:
 
 
 def part_rows(report: FitReport, good: bool) -> list[dict[str, str]]:
-    """For each part its name, centre, standard deviation, volume and margin, with units; empty if
-    not known. A poor estimate has no deviations: they would be read as bounds of its error."""
+    """For each part its name, centre, how far off that is at most (95 %), volume and margin, with
+    units; empty if not known. A poor estimate has no bounds."""
     rows = []
     for name, part in report.parts.items():
-        row = {"part": name, "centre": "not found", "std": "", "volume": "", "margin": ""}
+        row = {"part": name, "centre": "not found", "bound": "", "volume": "", "margin": ""}
         if part.center_mm is not None:
             (x, y, z), radius = part.center_mm, stated_radius(report.margin, name)
             row |= {"centre": f"({x:.1f}, {y:.1f}, {z:.1f}) mm"}
             row |= {"volume": f"{part.volume_ml:.1f} ml", "margin": radius.words if radius else ""}
-            row |= {"std": (part.deviation_words or "") if good else ""}
+            row |= {"bound": part.bound_words if good else ""}
         rows.append(row)
     return rows
 
@@ -67,6 +67,6 @@ def next_lines(estimate: Estimate | None) -> list[str]:
 
 
 def row_words(row: dict[str, str]) -> str:
-    std = row["std"] and f"standard deviation {row['std']}"
-    words = (f"centre {row['centre']}", std, row["volume"], row["margin"])
+    bound = row["bound"] and f"off by at most {row['bound']} (95 %)"
+    words = (f"centre {row['centre']}", bound, row["volume"], row["margin"])
     return f"{row['part']}: {', '.join(filter(None, words)).replace('centre not', 'not')}"

@@ -295,9 +295,9 @@ def margin_words(margin: MarginReport | None) -> str:
 
 
 def centre_label(report: FitReport, name: str, poor: bool) -> str:
-    """A tumor's name, with its standard deviation and margin as far as they are known."""
-    radius, deviation = stated_radius(report.margin, name), report.parts[name].deviation_words
-    words = [f"{name} POOR" if poor else name, *([f"std {deviation}"] if deviation else [])]
+    """A tumor's name, with how far off it is at most and its margin as far as they are known."""
+    radius, bound = stated_radius(report.margin, name), report.parts[name].bound_words
+    words = [f"{name} POOR" if poor else name, *([f"95 % within {bound}"] if bound else [])]
     return ", ".join([*words, radius.words if radius else "no margin stated"])
 
 

@@ -147,7 +147,7 @@ class StatusPanel:
         return f"no estimate: {self.result.reason}" if self.state == "none" else self.result.warning
 
     def numbers(self) -> str:
-        """Each part's volume, standard deviation and margin; latency and age."""
+        """Each part's volume, bound and margin; latency and age."""
         result = self.result
         if result is None:
             return ""
@@ -167,22 +167,22 @@ class StatusPanel:
 
     def _parts(self, report: FitReport) -> str:
         """A row for each part, with and without an estimate: nothing below must jump. After a
-        failed check the standard deviation is not valid, and left out."""
+        failed check the bound is not valid, and left out."""
         margins, good = report.margin, self.state == "good"
         stated = margins.stated[-1].confidence if margins and margins.stated else None
-        heads = ["", "volume", "standard deviation of place"]
+        heads = ["", "volume", "off by at most (95 %)"]
         heads += [f"{100 * stated:g} % margin"] if stated else []
         rows = []
         for label, name in enumerate(self.parts, start=1):
             part, margin = report.parts.get(name), stated_radius(margins, name)
             volume_ml = part.volume_ml if part else None
-            deviation = part.deviation_words if part and good else None
+            bound = part.bound_words if part and good else ""
             cells = [
                 f"<i style='background:{css(part_colour(label))}'></i>"
                 + escape(name.replace("_", " "))
                 + (" (not found)" if part is not None and not part.found else ""),
                 "–" if volume_ml is None else f"{volume_ml:.1f} ml",
-                deviation or "–",
+                bound or "–",
             ]
             cells += [f"{margin.mm:.1f} mm" if margin else "–"] if stated else []
             rows.append(f"<tr><td>{'</td><td>'.join(cells)}</td></tr>")
