@@ -333,7 +333,7 @@ class RegistrationLocator:
         share, looks = 0.0, fit.looks
         if size is not None and len(looks.points_mm):
             share = depth_share(size, bent.motion.centre_mm[2], looks.depth_error)
-        motion = self._registration.uncertain(bent, 0.0, self._calibration.std_scale)
+        motion = self._registration.uncertain(bent, share, self._calibration.std_scale)
         anatomy = self._shape.anatomy_ct
         moved = motion.carry(self._vertices_ct)
         ends = np.cumsum([len(mesh.vertices_mm) for mesh in self._surfaces])[:-1]
@@ -342,11 +342,10 @@ class RegistrationLocator:
         surfaces = {name: mesh.moved(places) for name, mesh, places in there}
         structures = {name: surfaces.pop(name) for name in anatomy.structures}
         places_ct = np.concatenate([self._samples_ct, self._shape.middles_ct])
-        fit_mm2 = motion.covariance_mm2(places_ct)
-        assert fit_mm2 is not None
-        motion = replace(motion, depth_share=share)
+        known_mm2 = motion.covariance_mm2(places_ct)
+        assert known_mm2 is not None
         along = share * motion.carry(places_ct)
-        known_mm2 = fit_mm2 + along[:, :, None] * along[:, None, :]
+        fit_mm2 = known_mm2 - along[:, :, None] * along[:, None, :]
         std_mm, count = largest_std_of(fit_mm2), len(self._samples_ct)
         spread = known_mm2[:count], known_mm2[count:], std_mm[:count], std_mm[count:]
         return _Placed(fit, bent, motion, surfaces, *spread, structures)
