@@ -470,7 +470,7 @@ def test_outlines_alone_are_an_answer_and_their_stated_error_counts(slim_model):
         tumor = found.report.parts["tumor_1"]
         off_mm = np.linalg.norm(np.array(tumor.center_mm) - at_all(TUMOR).mean(0))
         assert off_mm < 2
-        assert found.report.motion.depth_std_mm == 0  # no camera
+        assert found.report.motion.depth_share == 0  # no camera
         stds[std_mm, shared_mm] = tumor.center_std_mm
     assert stds[3.0, 0.0] > 1.2 * stds[0.3, 0.0]
     assert stds[0.3, 3.0] > 2 * stds[0.3, 0.0]

@@ -362,3 +362,10 @@ def test_what_else_may_be_the_organ_comes_with_it():
     (other,) = region.cloud.others
     assert np.median(column_of(region.cloud)) < 220 < np.median(column_of(other))
     assert points(two_domes(), picked_mm=region.cloud.points_mm[0]).cloud.others == ()
+    places = deproject(two_domes())[::-1]
+    strays = np.array([[0.0, 0.0, 100.0], [190.0, 0.0, 300.0]])
+    whole = SensorCloud(np.concatenate([strays, places]).astype(np.float32))
+    cloud = points(whole).cloud
+    (other,) = cloud.others
+    sides = [set((column_of(each) > 225).tolist()) for each in (cloud, other)]
+    assert sorted(sides, key=str) == [{False}, {True}]

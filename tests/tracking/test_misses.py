@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from reports import reporting
-from tumortrack.core.types import DepthError, SensorCloud
+from tumortrack.core.types import DepthError, Look, SensorCloud
 from tumortrack.models.report import estimate_of
 from tumortrack.tracking import misses, quality
 from tumortrack.tracking.fingerprint import fingerprint
@@ -53,7 +53,7 @@ def test_an_answer_says_how_far_off_its_tumors_may_be(estimate):
     organ, tumor = (estimate.report.parts[name] for name in ("kidney", "tumor_1"))
     assert organ.miss_mm is None
     known = figures(estimate.report, "tumor_1")
-    depth_mm = 1.96 * estimate.report.motion.depth_std_mm
+    depth_mm = 1.96 * estimate.report.motion.depth_share * math.hypot(*tumor.center_mm)
     assert depth_mm > 1
     assert tumor.miss_mm == pytest.approx(math.hypot(shipped().radius_mm(known), depth_mm))
     nearest_mm = np.linalg.norm(visible().points_mm - tumor.center_mm, axis=1).min()
@@ -78,3 +78,18 @@ def test_a_method_that_does_not_know_enough_has_none_and_keeps_the_older_checks(
     std_mm = quality._MAX_UNCERTAINTY_MM + 0.1
     unsure = reporting(surfaces, parts={"tumor_1": {"center_std_mm": std_mm}})
     assert quality._doubt(unsure.report).kind == "unsure"
+
+
+def test_of_several_cameras_the_worst_counts_and_one_that_nobody_stated(slim_model):
+    tracker, cloud = Tracker(load_model(slim_model, "cpu")), visible()
+    shares = {}
+    for first, second in ((0.0, 0.0), (0.0, 3.0), (3.0, 0.0), (0.0, None)):
+        error = None if second is None else DepthError(second)
+        look = Look(replace(cloud, depth_error=error), cloud, np.eye(4))
+        mine = replace(cloud, depth_error=DepthError(first))
+        found = tracker.locate(mine, 16, 0, evidence=[look])
+        shares[first, second] = found.report.motion.depth_share
+    assert shares[0.0, 0.0] == 0
+    assert shares[0.0, 3.0] == pytest.approx(shares[3.0, 0.0])
+    assert shares[0.0, 3.0] > 0.005
+    assert shares[0.0, None] > 0.005

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import Points, transform_points
-from tumortrack.core.report import NextEvidence
+from tumortrack.core.report import FAR_OFF, NextEvidence
 from tumortrack.live.values import TrackingResult
 
 _SHOWN_S = 3.0  # what contradicts the rest is dropped after one frame: too short to be seen
@@ -87,5 +87,5 @@ class Beside:
 def _placed(result: TrackingResult) -> bool:
     """Whether the organ lies there: else no place on it is worth touching."""
     return result.quality == "good" or (
-        result.finding is not None and result.finding.kind == "miss"
+        result.finding is not None and result.finding.kind in FAR_OFF
     )

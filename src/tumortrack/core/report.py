@@ -37,6 +37,9 @@ Kind = Literal[
 ]  # fmt: skip
 
 
+FAR_OFF = "miss", "depths"  # what makes an answer poor that nothing else speaks against
+
+
 class _Said(msgspec.Struct, forbid_unknown_fields=True):
     """Of a ``poor`` estimate the check that failed, and the sentence; of ``none``, and of a weak
     ``case``, the sentence."""
@@ -240,14 +243,14 @@ class AllowedPoses(_Value, frozen=True, kw_only=True):
 class MotionReport(_Value, frozen=True, kw_only=True):
     """The fitted motion: pose, elastic ``coefficients``, Gauss-Newton ``steps``. ``rarity``: of the
     library's state; ``compliance_std_mm``: of the compliance, whose coefficients are the last;
-    ``depth_std_mm``: of what the camera's depths err by, all alike, at the organ."""
+    ``depth_share``: standard deviation of the camera's depths, all alike, as a share of them."""
 
     camera_from_ct: tuple[tuple[float, float, float, float], ...]
     coefficients: tuple[float, ...]
     rarity: float
     steps: int
     compliance_std_mm: float | None
-    depth_std_mm: float = 0.0  # not stated by runs of before
+    depth_share: float = 0.0  # not stated by runs of before
 
 
 class StatedMargin(_Value, frozen=True, kw_only=True):
@@ -280,6 +283,7 @@ class FitReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
         in_sight: share of it that nothing hides.
         doubted_in_sight: ``in_sight`` when the camera last saw through it.
         cameras: numbers of those that saw it, where there are several.
+        piece: of the first image, in which it was found; 0: the likeliest (``SensorCloud.others``).
         peer: of a method beside this one: what it says of its fit.
     """
 
@@ -304,6 +308,7 @@ class FitReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     doubted_in_sight: float | None = None
     margin: MarginReport | None = None
     cameras: tuple[int, ...] = ()
+    piece: int = 0
     scan: ScanReport | None = None
     peer: dict[str, object] = {}
 

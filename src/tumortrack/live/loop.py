@@ -219,6 +219,7 @@ class Loop:
                 self._follower.forget()
             with timed(seconds, "frame"):
                 views, absent = self._cameras.views(seen)
+                views = [self._stated(view) for view in views]
             found, doubt = self.views.find(views, absent, seconds)
             organ = found[0][1]
             with timed(seconds, "locate"):
@@ -296,9 +297,6 @@ class Loop:
     def _calibrated(self, seen: Observation) -> Observation | InputError:
         """The frame with the intrinsics and depths that the user calibrated."""
         given, content = self._config.intrinsics, seen.content
-        if (stated := self._config.depth_error) is not None:
-            content = with_depth_error(content, stated)
-            seen = replace(seen, content=content)
         if given is None or not isinstance(content, DepthFrame):
             return seen
         has = content.intrinsics
@@ -314,9 +312,14 @@ class Loop:
                 f"{given.width} x {given.height}; calibrate for the size that is streamed."
             )
         depth_mm = self._config.correction.corrected(content.depth_mm)
-        if stated is not None:
-            given = replace(given, depth_error=stated)
         return replace(seen, content=DepthFrame(depth_mm, given, content.stamp_ns))
+
+    def _stated(self, view: CameraView) -> CameraView:
+        """With the depth error that the user states of all cameras."""
+        if (error := self._config.depth_error) is None:
+            return view
+        content = with_depth_error(view.seen.content, error)
+        return replace(view, seen=replace(view.seen, content=content))
 
     def _publish(self, result: TrackingResult, sink_workers: list[SinkWorker]) -> TrackingResult:
         if self._arms is not None:

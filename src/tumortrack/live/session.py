@@ -244,7 +244,8 @@ def _check(setup: CameraSetup, patient: Patient, what: str, options: TrackOption
         if corrects and getattr(source, "is_corrected", False):
             raise InputError(
                 f"the depths of {text} were corrected as they were recorded. Leave "
-                "--intrinsics out, or give it without depth_scale and depth_offset_mm."
+                "--intrinsics out, or give it without depth_scale and depth_offset_mm; say what "
+                "the calibration left by --depth-error MM."
             )
     if options.report is not None:
         check_report(options.report)

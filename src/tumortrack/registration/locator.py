@@ -19,6 +19,7 @@ from tumortrack.core.report import EvidenceReport, FitReport, SizeFit, Smoothing
 from tumortrack.core.types import (
     Anatomy,
     CameraLabels,
+    DepthError,
     Look,
     Mesh,
     OccupancyCloud,
@@ -300,8 +301,10 @@ class RegistrationLocator:
         poses = [look.camera_from_look for look in looks[1:]]
         candidates_mm = looks[0].cloud.candidates_mm
         noises = [look.cloud.noise for look in looks if look.cloud.noise is not None]
-        error = looks[0].cloud.depth_error
-        return Looks.of(points_mm, poses, evidence, noises, candidates_mm, error)
+        errors = [look.cloud.depth_error for look in looks]
+        stated = [error for error in errors if error is not None]
+        worst = DepthError(*np.max(stated, axis=0)) if len(stated) == len(errors) else None
+        return Looks.of(points_mm, poses, evidence, noises, candidates_mm, worst)
 
     def warm(self) -> None:
         """See ``tracking.tracker.Tracker.warm``."""

@@ -70,7 +70,7 @@ class Looks:
         evidence: what is known beside the points.
         noise: of the points; where looks differ, that of the worst.
         candidates_mm: points of a single look that may be the organ's too.
-        depth_error: of the cameras.
+        depth_error: of the cameras, of the worst; None: of one of them nobody has stated it.
     """
 
     points_mm: Points

@@ -164,7 +164,13 @@ def seen_from_first(motion: ElasticMotion, camera_from_look: Affine) -> ElasticM
     rivals = tuple(
         (seen_from_first(rival, camera_from_look), share) for rival, share in motion.rivals
     )
-    return replace(motion, rotation=turn @ motion.rotation, centre_mm=centre_mm, rivals=rivals)
+    return replace(
+        motion,
+        rotation=turn @ motion.rotation,
+        centre_mm=centre_mm,
+        rivals=rivals,
+        depth_share=0.0,  # of the first camera, which lies elsewhere
+    )
 
 
 def blend(a: ElasticMotion, b: ElasticMotion, share: float) -> ElasticMotion:

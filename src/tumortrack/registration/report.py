@@ -72,7 +72,7 @@ def motion_entry(motion: ElasticMotion, fit: RegistrationResult, bent: BentFit) 
         rarity=fit.motion.rarity,
         steps=bent.steps,
         compliance_std_mm=bent.compliance_std_mm,
-        depth_std_mm=float(motion.depth_share * motion.centre_mm[2]),
+        depth_share=motion.depth_share,
     )
 
 

@@ -122,11 +122,13 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
     if estimate.quality == "poor" and views[0].unit is not None:
         doubt = f"if that is not the organ, or not all of it: {_ASK}; --whole takes all."
         about["notes"].append(doubt)
-    if not options.depth_error and organs[0].depth_error is None and clouds[0] != NO_CLOUD:
+    unstated = any(organ.depth_error is None for organ in organs)
+    if unstated and estimate.report.motion is not None and clouds[0] != NO_CLOUD:
+        within_mm = depths_within_mm(estimate.report, model.parts[0])
         about["notes"].append(
-            f"depths may be {depths_within_mm(estimate.report):.1f} mm off here (95 %), all alike: "
-            "nobody says how well this camera is calibrated (--depth-error, or depth_left_mm in "
-            "the intrinsics file)."
+            f"depths may be {within_mm:.1f} mm off here (95 %), all alike: "
+            "nobody says how well this camera is calibrated (--depth-error; of depth images also "
+            "depth_left_mm in the intrinsics file)."
         )
     if options.poses is not None and estimate.report.looks is not None:
         about["looks"] = {

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import UInt8
 
-from tumortrack.core.report import FitReport, NextEvidence
+from tumortrack.core.report import FAR_OFF, FitReport, NextEvidence
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.tracking.margins import stated_radius
 
@@ -54,7 +54,7 @@ def part_rows(report: FitReport, good: bool) -> list[dict[str, str]]:
 
 def next_evidence(estimate: Estimate | None) -> tuple[NextEvidence, ...]:
     """What to learn next; nothing of an answer that may be another organ, or in another place."""
-    if estimate is None or (estimate.finding is not None and estimate.finding.kind != "miss"):
+    if estimate is None or (estimate.finding is not None and estimate.finding.kind not in FAR_OFF):
         return ()
     return estimate.report.next_evidence
 

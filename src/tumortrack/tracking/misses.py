@@ -20,8 +20,8 @@ from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.report import FitReport
 
 _NAME = "misses.json"
-# An answer is poor from this radius on. With the method that misses.json names, 65 % of answers of
-# kidneys left out were good then, and 1.3 % of these over 5 mm off; from 5 mm on 54 and 1.2 %.
+# An answer is poor from this radius on. docs/trust.md has what that is worth for kidneys and
+# families of physics left out.
 POOR_MM = 6.0
 _MOST_STRAYS, _FARTHEST_RIVAL_MM = 0.3, 10.0  # more say no more
 _LEAST_HELD_MM = 0.05  # nor does less
@@ -72,17 +72,20 @@ def figures(report: FitReport, name: str) -> dict[str, float] | None:
     }
 
 
-def depths_within_mm(report: FitReport) -> float:
-    """How far off the camera's depths are at most, all alike, where the organ is (95 %)."""
-    return 0.0 if report.motion is None else _WITHIN * report.motion.depth_std_mm
+def depths_within_mm(report: FitReport, name: str) -> float:
+    """How far off a part's centre is at most (95 %) by what all depths of the camera err alike."""
+    center_mm = report.parts[name].center_mm
+    if report.motion is None or center_mm is None:
+        return 0.0
+    return _WITHIN * report.motion.depth_share * math.hypot(*center_mm)
 
 
 def with_misses(report: FitReport) -> FitReport:
     """The report with ``miss_mm`` of its tumors, where the method knows enough: what was learned,
     and what the camera's depths err by beside that."""
-    parts, depth_mm = dict(report.parts), depths_within_mm(report)
+    parts = dict(report.parts)
     for name, part in report.tumors.items():
         if (known := figures(report, name)) is not None:
-            miss_mm = math.hypot(shipped().radius_mm(known), depth_mm)
+            miss_mm = math.hypot(shipped().radius_mm(known), depths_within_mm(report, name))
             parts[name] = msgspec.structs.replace(part, miss_mm=miss_mm)
     return msgspec.structs.replace(report, parts=parts)

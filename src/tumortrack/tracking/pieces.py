@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from tumortrack.core.errors import NotThisOrgan
+from tumortrack.core.errors import NoEstimate, NotThisOrgan
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import DepthFrame, Look
 from tumortrack.tracking.misses import POOR_MM
@@ -16,26 +17,40 @@ _ELSEWHERE = "fit", "strays", "seen_through", "size"  # checks that speak for an
 
 
 def likeliest_piece(
-    looks: Sequence[Look], located: Callable[[Sequence[Look]], Estimate]
+    looks: Sequence[Look], located: Callable[[Sequence[Look]], Estimate], most: int | None = None
 ) -> tuple[Estimate, Sequence[Look]]:
     """The estimate in the first look's points or, where these are not the organ, in another piece
-    of its image (``SensorCloud.others``); and the looks with that piece. ``located``: finds and
-    judges it. Raises NotThisOrgan: none is the organ."""
+    of its image (``SensorCloud.others``, up to ``most``); and the looks with that piece.
+    ``located``: finds and judges it. Raises NotThisOrgan: none is the organ."""
     found: list[tuple[Estimate, Sequence[Look]]] = []
     first: NotThisOrgan | None = None
-    for cloud in (looks[0].cloud, *looks[0].cloud.others):
-        tried = (replace(looks[0], cloud=cloud), *looks[1:])
+    main, start_s = looks[0], time.perf_counter()
+    alone = main.seen is main.cloud
+    for number, cloud in enumerate((main.cloud, *main.cloud.others[:most])):
+        tried: Sequence[Look] = (
+            replace(main, cloud=cloud, seen=cloud if alone else main.seen),
+            *looks[1:],
+        )
         try:
-            estimate = located(tried)
+            estimate = located(tried).reporting(piece=number)
         except NotThisOrgan as error:
             first = first or error
             continue
+        except NoEstimate:
+            if not number:
+                raise
+            continue  # another piece that cannot be an organ
         found.append((estimate, tried))
-        if not _doubted(estimate) and (len(found) == 1 or _sure(estimate)):
+        if _sure(estimate) or (not number and not _doubted(estimate)):
             break
     if first is not None and not found:
         raise first
-    return found[0] if len(found) == 1 else max(found, key=_likelihood)
+    estimate, tried = found[0] if len(found) == 1 else max(found, key=_likelihood)
+    timings = estimate.report.timings
+    if (other_s := time.perf_counter() - start_s - timings["total"]) > 0 and number:
+        total_s = timings["total"] + other_s
+        estimate = estimate.reporting(timings={**timings, "pieces": other_s, "total": total_s})
+    return estimate, tried
 
 
 def _doubted(estimate: Estimate) -> bool:

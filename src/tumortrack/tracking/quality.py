@@ -198,7 +198,7 @@ def _doubt(report: FitReport) -> Finding | None:
     values["digits"] = digits
     if not miss_mm > POOR_MM:
         return None
-    depth_mm = depths_within_mm(report)
+    depth_mm = depths_within_mm(report, name)
     if 2 * depth_mm**2 > miss_mm**2:  # most of it
         return Finding("depths", {"depth_mm": depth_mm})
     return Finding("miss", values)

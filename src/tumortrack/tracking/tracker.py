@@ -145,7 +145,7 @@ class Tracker:
             return self._judged(self._locator.follow(looks, last, how), looks, strictly, last)
 
         with self._explaining_errors(looks, how, bool(pieces or (last and last.evidence))):
-            estimate, looks = likeliest_piece(looks, located)
+            estimate, looks = likeliest_piece(looks, located, most=1)  # a frame may not wait
         return self._explained(estimate, looks, how)
 
     def _judged(
@@ -159,8 +159,6 @@ class Tracker:
         estimate = judged(estimate, looks, strictly)
         if last is not None:
             estimate = doubt_if_hidden(estimate, last)
-        if self._weakness:
-            estimate = replace(estimate, finding=Finding("model", {"words": self._weakness}))
         margins = self.model.margins if len(looks) == 1 else None  # calibrated on single looks
         estimate = with_margin(estimate, looks[0].cloud, margins)
         estimate = replace(estimate, patient=self._patient, organ=self._organ)
@@ -169,7 +167,9 @@ class Tracker:
     def _explained(self, estimate: Estimate, looks: Sequence[Look], how: FollowOptions) -> Estimate:
         """A poor estimate with its likely causes and advice."""
         start = time.perf_counter()
-        if estimate.finding is not None and not self._weakness:
+        if self._weakness:
+            estimate = replace(estimate, finding=Finding("model", {"words": self._weakness}))
+        elif estimate.finding is not None:
             causes = self._causes(looks, how, estimate)
             alone = isinstance(looks[0].seen, SensorCloud) and not len(looks[0].seen.points_mm)
             # Touches hide nothing, and no camera can look elsewhere.
@@ -230,7 +230,8 @@ def _parted(
 
 def _cleaned(look: Look) -> Look:
     """What was seen is cleaned with the organ's points where it is no more than these."""
-    cloud = clean_cloud(look.cloud)
+    others = tuple(map(clean_cloud, look.cloud.others))
+    cloud = replace(clean_cloud(look.cloud), others=others)
     return replace(look, cloud=cloud, seen=cloud if look.seen is look.cloud else look.seen)
 
 

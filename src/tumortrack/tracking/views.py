@@ -38,7 +38,6 @@ from tumortrack.tracking.options import LocateOptions
 
 NO_CLOUD = Path("-")
 _NEAR = 3  # pixels from the one of --at
-_MOSTLY = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,19 +92,21 @@ class View:
         last = "" if noise is None else f"; {noise.words}"
         return OrganInView(found.cloud, entry, found.taken, (words, last)).with_pixels(found.taken)
 
-    def fitted(self, found: OrganInView, motion: ElasticMotion, within_mm: float) -> OrganInView:
-        """The organ in a depth image once it is fitted: other pieces that lie on it are its own."""
+    def fitted(
+        self, found: OrganInView, motion: ElasticMotion, within_mm: float, piece: int
+    ) -> OrganInView:
+        """The organ in a depth image once it is fitted, in the ``piece`` of that number: other
+        pieces that lie on it are its own."""
+        if piece:
+            found = found._replace(cloud=found.cloud.others[piece - 1])
         if found.taken is None or not isinstance(self.content, DepthFrame):
             return found
-        beside = np.flatnonzero(np.isin(found.taken, (ORGAN, THIN, PIECES)))
-        on = lies_on(motion, image_of_frame(self.content, None).points(beside), within_mm)
-        taken, was = found.taken.copy(), found.taken.ravel()[beside] == ORGAN
-        if on[was].mean() < _MOSTLY:  # it was found in another piece
-            taken.ravel()[beside] = PIECES
-            clouds = (found.cloud, *found.cloud.others)
-            on_each = [lies_on(motion, cloud.points_mm, within_mm).mean() for cloud in clouds]
-            found = found._replace(cloud=clouds[int(np.argmax(on_each))])
-        taken.ravel()[beside[on]] = ORGAN
+        taken = found.taken.copy()
+        if piece:
+            taken[taken == ORGAN] = PIECES
+        beside = np.flatnonzero(np.isin(taken, (THIN, PIECES)))
+        points_mm = image_of_frame(self.content, None).points(beside)
+        taken.ravel()[beside[lies_on(motion, points_mm, within_mm)]] = ORGAN
         return found.with_pixels(taken)
 
     def _cropped(
@@ -140,9 +141,10 @@ class OrganInView(NamedTuple):
         returns = sum(n for name, n in counts.items() if name != "no return")
         others = ", ".join(f"{name} {n}" for name, n in counts.items()
                            if name not in ("organ", "no return"))  # fmt: skip
-        words = f"{counts['organ']} of {returns} pixels with a return were taken for the organ, by "
+        organ = counts.get("organ", 0)
+        words = f"{organ} of {returns} pixels with a return were taken for the organ, by "
         words += f"{self.entry['hint']}{f' (others: {others})' if others else ''}"
-        entry = {"organ": counts["organ"], "of": returns, "pixels": counts}
+        entry = {"organ": organ, "of": returns, "pixels": counts}
         entry["words"] = f"{self.around[0]}{words}{self.around[1]}."
         return self._replace(taken=taken, entry={**self.entry, **entry})
 
@@ -242,9 +244,10 @@ def as_fitted(
         return list(found)
     refine = model.config.refine
     ways = [np.eye(4)] if looks is None else [np.array(pose) for pose in looks.camera_from_look]
-    out = []
+    out: list[OrganInView] = []
     for view, organ, way in zip(views, found, ways, strict=True):
         width_mm = kernel_width_mm(refine, organ.cloud.noise or PointNoise())
         there = seen_from_first(motion, np.linalg.inv(way))
-        out.append(view.fitted(organ, there, FARTHEST * width_mm))
+        piece = 0 if out else estimate.report.piece  # further views have their likeliest
+        out.append(view.fitted(organ, there, FARTHEST * width_mm, piece))
     return out

@@ -124,9 +124,10 @@ def _scale(
     inside = abs(offset_mm) <= _TRAINED.offset_mm and abs(scale) <= _TRAINED.scale
     if not inside:
         warnings.append(
-            f"depth is off by {100 * scale:+.1f} % and {offset_mm:+.1f} mm; models are trained for "
-            f"up to {100 * _TRAINED.scale:g} % and {_TRAINED.offset_mm:g} mm. The intrinsics.json "
-            "that is written here corrects it; the camera itself should be calibrated again"
+            f"depth is off by {100 * scale:+.1f} % and {offset_mm:+.1f} mm; a camera is presumed "
+            f"to have up to {100 * _TRAINED.scale:g} % and {_TRAINED.offset_mm:g} mm. The "
+            "intrinsics.json that is written here corrects it; the camera itself should be "
+            "calibrated again"
         )
     return {
         "scale": float(scale),
@@ -143,6 +144,8 @@ def _scale(
 def correction(said: dict[str, Any]) -> dict[str, float]:
     """What intrinsics.json says of it: true = depth_scale * measured + depth_offset_mm, right to
     depth_left_mm."""
+    if "scale" not in said:  # too few poses to know what is left
+        return {}
     left = {"depth_left_mm": said["left_mm"]}
     if not said["corrected"]:
         return left

@@ -13,6 +13,7 @@ from scipy.stats import spearmanr
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import FAR_MM
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.report import FAR_OFF
 from tumortrack.core.types import DepthFrame
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.report.rivals import best_rigid_pose, rigid_fit
@@ -111,4 +112,4 @@ def left_out(rows: pd.DataFrame, part: str, by: str | None = None) -> pd.DataFra
 
 def _acceptable(rows: pd.DataFrame) -> pd.Series:
     """Whether nothing but what was learned speaks against an answer."""
-    return rows.finding.isna() | rows.finding.isin(("miss", "depths"))
+    return rows.finding.isna() | rows.finding.isin(FAR_OFF)

@@ -27,6 +27,8 @@ from tumortrack.sense.region.working_image import (
     BOX,
     COLOUR,
     LAST_BOX,
+    ORGAN,
+    PIECES,
     RANGE,
     RegionConfig,
     WorkingImage,
@@ -97,10 +99,7 @@ def organ_points(
     others: list[np.ndarray] = []
     if config.pieces:
         window, part = image.cropped()
-        others = [
-            np.flatnonzero(_in_window(image, window, mask))
-            for mask in choose_pieces(part, config, hints)
-        ]
+        others = [_pixels_of(image, window, mask) for mask in choose_pieces(part, config, hints)]
         image.taken[window] = part.taken
     counts = image.counts()
     remaining = image.remaining(image.taken)
@@ -159,9 +158,10 @@ def _image_of(
 def _noise_in_reach(frame: DepthFrame, config: RegionConfig, hints: Hints) -> DepthNoise | None:
     """Measured where the organ can be; if nothing there is smooth, in the whole image."""
     near_mm, far_mm = config.crop.near_mm, config.crop.far_mm
-    if hints.last_box_mm is not None:
-        near_mm = max(near_mm, float(hints.last_box_mm[0][2]) - config.last_margin_mm)
-        far_mm = min(far_mm, float(hints.last_box_mm[1][2]) + config.last_margin_mm)
+    boxes = [(config.box_mm, 0.0), (hints.last_box_mm, config.last_margin_mm)]
+    for corners, margin_mm in ((np.array(box), more) for box, more in boxes if box is not None):
+        near_mm = max(near_mm, float(corners[:, 2].min()) - margin_mm)
+        far_mm = min(far_mm, float(corners[:, 2].max()) + margin_mm)
     there = (frame.depth_mm > near_mm) & (frame.depth_mm < far_mm)
     if hints.mask is not None and hints.mask.shape == there.shape:
         there &= hints.mask
@@ -198,10 +198,11 @@ def _depth_error(content: DepthFrame | SensorCloud) -> DepthError | None:
     )
 
 
-def _in_window(image: WorkingImage, window: Any, mask: np.ndarray) -> np.ndarray:
-    whole = np.zeros(image.taken.shape, bool)
-    whole[window] = mask
-    return whole
+def _pixels_of(image: WorkingImage, window: Any, mask: np.ndarray) -> np.ndarray:
+    """Of a piece in a window of the image, as ``WorkingImage.remaining`` has them."""
+    taken = np.full_like(image.taken, PIECES)
+    taken[window] = np.where(mask, ORGAN, PIECES)
+    return image.remaining(taken)
 
 
 def _as_noisy(config: RegionConfig, noise: DepthNoise, window_px: int) -> RegionConfig:

@@ -62,7 +62,7 @@ def choose_pieces(image: WorkingImage, config: RegionConfig, hints: Hints) -> li
     _, pieces, sizes, chosen = best
     image.remove(pieces == 0, THIN)
     if hints.last_box_mm is not None and chosen.any():
-        # A protruding tumor, a part beyond a crease: in the box, not at its far side, not thin.
+        # A protruding tumor, a part beyond a fold: in the box, not at its far side, not thin.
         low, high = np.sort(np.asarray(hints.last_box_mm, np.float64), axis=0)
         high[2] -= _FAR_SIDE * (high[2] - low[2])
         box = low - _BOX_MM, high + _BOX_MM
