@@ -88,7 +88,8 @@ def read_lens(path: Path) -> Lens:
 
 
 def lens_of(one: Intrinsics, **more: Any) -> Lens:
-    return Lens(**{name: getattr(one, name) for name in one.__dataclass_fields__}, **more)
+    names = "width", "height", "fx", "fy", "cx", "cy"
+    return Lens(**{name: getattr(one, name) for name in names}, **more)
 
 
 @lru_cache(maxsize=4)
