@@ -282,9 +282,10 @@ def test_a_wrong_scale_of_the_camera_shows_in_the_fit(times):
     points = times * surface(placed(), 1000)
     start = dataclasses.replace(START, centre_mm=times * START.centre_mm)
     fit = refined(points, start, config)
-    found, gain = apparent_size(fit.motion, fit.looks, config)
-    assert abs(found - times) < 0.6 * abs(times - 1) + 0.01  # the robust kernel reads too little
-    assert (gain > 9.2) == (times != 1)
+    size = apparent_size(fit.motion, fit.looks, config)
+    assert abs(size.times - times) < 0.6 * abs(times - 1) + 0.01  # the robust kernel reads too little
+    assert (size.gain > 9.2) == (times != 1)
+    assert size.gain == pytest.approx(((size.times - 1) / size.std) ** 2)
 
 
 def test_every_step_lowers_the_cost_and_enough_steps_end():
