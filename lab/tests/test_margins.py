@@ -17,7 +17,7 @@ from tumortrack.simulate.scene_folder import list_scenes, read_scene
 from tumortrack.tracking.margins import read_margins
 from tumortrack_lab.world.evidence import EXACT, EvidenceSource
 
-COUNT = 40  # 7 tested states without a gross miss show 50 %; two fifths of good ones are tested
+COUNT = 56  # 7 tested states without a gross miss show 50 %; two fifths of good ones are tested
 
 
 @pytest.fixture(scope="module")
