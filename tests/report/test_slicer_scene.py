@@ -47,7 +47,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     save_case(Case(parts, labels, (0.0, -1.0, 0.0), ct=ct, patient=left), top / "case")
     found = reporting(
         replace(small_estimate(), finding=None),
-        parts={"tumor_1": {"center_std_mm": 1.26}},
+        parts={"tumor_1": {"miss_mm": 1.26}},
         motion={**NOWHERE, "camera_from_ct": CAMERA_FROM_CT.tolist()},
         margin={"stated": [{"confidence": 0.95, "mm": {"tumor_1": 5.0}}]},
     )
@@ -139,7 +139,7 @@ def test_slicer_shows_a_run_and_the_ct_where_the_organ_is(folders, scenes) -> No
     np.testing.assert_allclose(RAS_FROM_LPS @ now_ras, CAMERA_FROM_CT @ point_lps, atol=1e-5)
     check_models(nodes, run, "kidney", "tumor_1", "tumor_1_margin", "tumor_2")
     places = {
-        "tumor_1, std 1.3 mm, 95 % margin 5.0 mm": np.array([14.0, -3, 120]),
+        "tumor_1, 95 % within 1.3 mm, 95 % margin 5.0 mm": np.array([14.0, -3, 120]),
         "tumor_2, no margin stated": np.array([-6.0, 5, 138]),
     }
     check_points(nodes["tumors"], places)
