@@ -283,7 +283,8 @@ def test_a_wrong_scale_of_the_camera_shows_in_the_fit(times):
     start = dataclasses.replace(START, centre_mm=times * START.centre_mm)
     fit = refined(points, start, config)
     size = apparent_size(fit.motion, fit.looks, config)
-    assert abs(size.times - times) < 0.6 * abs(times - 1) + 0.01  # the robust kernel reads too little
+    # The robust kernel reads too little.
+    assert abs(size.times - times) < 0.6 * abs(times - 1) + 0.01
     assert (size.gain > 9.2) == (times != 1)
     assert size.gain == pytest.approx(((size.times - 1) / size.std) ** 2)
 
