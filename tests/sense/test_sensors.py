@@ -16,7 +16,7 @@ from tumortrack.sense.measured_noise import depth_step_mm, image_noise
 from tumortrack.sense.noise import D405_NOISE, STEREO_NOISE, add_noise
 from tumortrack.sense.sensors import FIGURES, depth_error_of, simulated
 from tumortrack.simulate.scene_folder import read_scene
-from tumortrack.tracking.options import SimulatedSensor, SimulateOptions
+from tumortrack.tracking.options import LocateOptions, SimulatedSensor, SimulateOptions
 
 FLIGHT = [name for name in FIGURES if "flying_share" in FIGURES[name]]
 # Sensor and distance, where it sees so near; of an endoscope nothing is published beyond 150 mm.
@@ -264,7 +264,8 @@ def test_simulate_writes_scenes_of_another_camera(phantom_case, tmp_path):
 
 
 def test_a_cameras_error_is_stated_in_mm_or_by_its_kind():
-    assert depth_error_of("") is None
+    assert LocateOptions().stated_error is None
+    assert LocateOptions(depth_error="0.5").stated_error == (0.5, 0.0)
     assert depth_error_of("0.5") == (0.5, 0.0)
     assert depth_error_of("d405-measured") == (5.0, 0.02)
     assert depth_error_of("azure-kinect") == (25.0, 0.001)  # 10, and 15 of tissue

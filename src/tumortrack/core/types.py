@@ -228,6 +228,10 @@ class DepthFrame:
     def __post_init__(self) -> None:
         _freeze(self, "depth_mm", np.float32, (self.intrinsics.height, self.intrinsics.width))
 
+    @property
+    def depth_error(self) -> DepthError | None:
+        return self.intrinsics.depth_error
+
     def with_depth(self, depth_mm: Float32[np.ndarray, "h w"]) -> DepthFrame:
         """The same frame with another depth, which is not copied but becomes read-only."""
         depth_mm.flags.writeable = False

@@ -30,7 +30,6 @@ from tumortrack.live.workers import SinkWorker, SourceWorker
 from tumortrack.models.folder import patient_of, read_model_manifest
 from tumortrack.models.model import Model
 from tumortrack.sense.files import DepthCorrection, read_camera
-from tumortrack.sense.sensors import depth_error_of
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.options import TrackOptions, model_folder
 from tumortrack.tracking.tracker import FollowerConfig, Tracker
@@ -261,7 +260,7 @@ def _loop_config(options: TrackOptions, model: Model) -> LoopConfig:
         ),
         intrinsics=intrinsics,
         correction=correction,
-        depth_error=depth_error_of(options.depth_error),
+        depth_error=options.stated_error,
         stale_s=options.stale,
         frozen_s=options.frozen,
         scan=options.scan,

@@ -314,7 +314,8 @@ class RegistrationLocator:
         points = Frame(self._model, cloud, 0, np.random.default_rng(0)).points_mm
         looks = Looks.of([points])
         fit = self._registration.best_fit(looks, [*self._registration.search.starts(looks), rest])
-        self._carry(self._moved(*self._registration.bend(fit)), 0)
+        size = apparent_size(fit.motion, fit.looks, self._registration.config)
+        self._carry(self._moved(*self._registration.bend(fit), size), 0)
         for surface in range(len(self._touchable)):
             self._shape.field(surface)
 
@@ -330,11 +331,9 @@ class RegistrationLocator:
         with frame.stage("surfaces"):
             return self._moved(fit, bent, size)
 
-    def _moved(
-        self, fit: RegistrationResult, bent: BentFit, size: SizeFit | None = None
-    ) -> _Placed:
+    def _moved(self, fit: RegistrationResult, bent: BentFit, size: SizeFit) -> _Placed:
         share, looks = 0.0, fit.looks
-        if size is not None and len(looks.points_mm):
+        if len(looks.points_mm):
             share = depth_share(size, bent.motion.centre_mm[2], looks.depth_error)
         motion = self._registration.uncertain(bent, share, self._calibration.std_scale)
         anatomy = self._shape.anatomy_ct

@@ -49,8 +49,7 @@ def cloud_from_depth(
         raise _too_few(len(index), frame, config.near_mm, config.far_mm)
     chosen = rng.choice(index, min(len(index), config.n_points), replace=False)
     points_mm = deproject_pixels(chosen, depth_mm[chosen].astype(np.float64), frame.intrinsics)
-    error = frame.intrinsics.depth_error
-    return SensorCloud(points_mm, frame.stamp_ns, depth_error=error)
+    return SensorCloud(points_mm, frame.stamp_ns, depth_error=frame.depth_error)
 
 
 def thin_cloud(cloud: SensorCloud, n_points: int, rng: np.random.Generator) -> SensorCloud:

@@ -300,7 +300,8 @@ def _numbers(value: object, key: str, path: Path) -> list[float]:
 
 
 def intrinsics_json(intrinsics: Intrinsics) -> dict[str, Any]:
-    """Content of intrinsics.json beside a depth.png: the pinhole and the mm per step of depth."""
+    """Content of intrinsics.json beside a depth.png: the pinhole, the mm per step of depth, and a
+    depth error that is the same at every depth."""
     values = {key: getattr(intrinsics, key) for key in _PINHOLE_KEYS}
     stated: dict[str, Any] = {**values, "depth_unit_mm": DEPTH_UNIT_MM}
     if intrinsics.depth_error is not None and not intrinsics.depth_error.scale:

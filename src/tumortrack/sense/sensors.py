@@ -202,11 +202,9 @@ def simulated(
     return msgspec.convert({**figures, **options}, SensorConfig)
 
 
-def depth_error_of(stated: str | float) -> DepthError | None:
+def depth_error_of(stated: str | float) -> DepthError:
     """``--depth-error``: of a calibrated camera, mm; or a camera's kind, which nobody calibrated:
     its published bias, with what tissue adds. Raises InputError: it is neither."""
-    if stated == "":
-        return None
     if stated in FIGURES:
         camera = SensorConfig(**{key: value for key, (value, _, _) in FIGURES[str(stated)].items()})
         return DepthError(camera.offset_mm + camera.warp_mm + camera.tissue_mm[1], camera.scale)

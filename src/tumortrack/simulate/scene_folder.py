@@ -122,7 +122,7 @@ def read_scene(folder: Path) -> Scene:
     if depth.exists() and not camera.exists():
         raise InputError(f"{folder} has depth.png but lacks intrinsics.json, which explains it.")
     frame = read_depth_png(depth, camera) if depth.exists() else None
-    error = None if frame is None else frame.intrinsics.depth_error
+    error = None if frame is None else frame.depth_error
     points_mm = read_cloud(folder / "cloud.ply")[0].points_mm
     cloud = SensorCloud(points_mm, stamp_ns, depth_error=error)
     targets = read_targets(table) if table.exists() else None

@@ -13,6 +13,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.patient import UNKNOWN, Patient
 
 if TYPE_CHECKING:
+    from tumortrack.core.types import DepthError
     from tumortrack.models.model import Model
     from tumortrack.sense.region import RegionConfig
     from tumortrack.simulate.scene import SceneConfig
@@ -65,6 +66,15 @@ class RegionOptions(PatientOptions):
     box: tuple[float, float, float, float, float, float] | None = None
     whole: bool = False
     depth_error: str = ""
+
+    @property
+    def stated_error(self) -> DepthError | None:
+        """Raises InputError: it is neither mm nor a camera."""
+        if self.depth_error == "":
+            return None
+        from tumortrack.sense.sensors import depth_error_of
+
+        return depth_error_of(self.depth_error)
 
     def region(self, model: Model) -> RegionConfig:
         """Raises InputError: an invalid range or box."""

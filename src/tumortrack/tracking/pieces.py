@@ -66,9 +66,9 @@ def _sure(estimate: Estimate) -> bool:
 def _likelihood(found: tuple[Estimate, Sequence[Look]]) -> tuple[bool, float]:
     """Whether it is sure; and of the image with the organ there. Of a cloud the points that do not
     stray are counted."""
-    (estimate, looks), seen = found, found[1][0].seen
-    if isinstance(seen, DepthFrame):
-        return _sure(estimate), explained(estimate.organ_mesh, seen, looks[0])
+    estimate, (look, *_) = found
+    if isinstance(look.seen, DepthFrame):
+        return _sure(estimate), explained(estimate.organ_mesh, look)
     cost = estimate.report.fit_cost
     strays = 0.0 if cost is None else cost.strays
-    return _sure(estimate), len(looks[0].cloud.points_mm) * (1 - strays)
+    return _sure(estimate), len(look.cloud.points_mm) * (1 - strays)

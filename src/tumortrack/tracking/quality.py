@@ -283,10 +283,11 @@ def seen_through(
     return float(through), float(rim_share), float(in_sight)
 
 
-def explained(organ: Mesh, frame: DepthFrame, look: Look) -> float:
-    """Log-likelihood of an image with the organ there, but for a constant and a factor: each pixel
-    that shows its surface speaks for it, each that shows what it would hide against it."""
-    seen_mm, organ_mm = _compared(organ, frame)
+def explained(organ: Mesh, look: Look) -> float:
+    """Log-likelihood of a look's depth image with the organ there, but for a constant and a factor:
+    each pixel that shows its surface speaks for it, each that shows what it would hide against."""
+    assert isinstance(look.seen, DepthFrame)
+    seen_mm, organ_mm = _compared(organ, look.seen)
     off_mm, behind_mm = seen_mm - organ_mm, _behind_mm(look)  # NaN where one shows nothing
     on, through = np.abs(off_mm) < _ON * behind_mm, off_mm > behind_mm
     return float(on.sum() - _AGAINST * through.sum())

@@ -117,11 +117,11 @@ class Tracker:
             looks = (Look(replace(alone, stamp_ns=cloud.stamp_ns), cloud, HERE),)
 
         def located(looks: Sequence[Look]) -> Estimate:
-            return self._judged(self._locator.locate(looks, grid, seed, pieces), looks, False)
+            return _judged(self._locator.locate(looks, grid, seed, pieces), looks, False)
 
         with self._explaining_errors(looks, _DEFAULTS, bool(pieces)):
             estimate, looks = likeliest_piece(looks, located)
-        return self._explained(estimate, looks, _DEFAULTS)
+        return self._explained(self._with_models_word(estimate, looks), looks, _DEFAULTS)
 
     def follow(
         self,
@@ -142,23 +142,17 @@ class Tracker:
             how = msgspec.structs.replace(how, evidence=(*how.evidence, *pieces))
 
         def located(looks: Sequence[Look]) -> Estimate:
-            return self._judged(self._locator.follow(looks, last, how), looks, strictly, last)
+            return _judged(self._locator.follow(looks, last, how), looks, strictly, last)
 
         with self._explaining_errors(looks, how, bool(pieces or (last and last.evidence))):
             estimate, looks = likeliest_piece(looks, located, most=1)  # a frame may not wait
-        return self._explained(estimate, looks, how)
+        return self._explained(self._with_models_word(estimate, looks), looks, how)
 
-    def _judged(
-        self,
-        estimate: Estimate,
-        looks: Sequence[Look],
-        strictly: bool,
-        last: Estimate | None = None,
-    ) -> Estimate:
+    def _with_models_word(self, estimate: Estimate, looks: Sequence[Look]) -> Estimate:
+        """The estimate with what the model says: its weakness, its margins, whose it is."""
         start = time.perf_counter()
-        estimate = judged(estimate, looks, strictly)
-        if last is not None:
-            estimate = doubt_if_hidden(estimate, last)
+        if self._weakness:
+            estimate = replace(estimate, finding=Finding("model", {"words": self._weakness}))
         margins = self.model.margins if len(looks) == 1 else None  # calibrated on single looks
         estimate = with_margin(estimate, looks[0].cloud, margins)
         estimate = replace(estimate, patient=self._patient, organ=self._organ)
@@ -167,9 +161,7 @@ class Tracker:
     def _explained(self, estimate: Estimate, looks: Sequence[Look], how: FollowOptions) -> Estimate:
         """A poor estimate with its likely causes and advice."""
         start = time.perf_counter()
-        if self._weakness:
-            estimate = replace(estimate, finding=Finding("model", {"words": self._weakness}))
-        elif estimate.finding is not None:
+        if estimate.finding is not None and not self._weakness:
             causes = self._causes(looks, how, estimate)
             alone = isinstance(looks[0].seen, SensorCloud) and not len(looks[0].seen.points_mm)
             # Touches hide nothing, and no camera can look elsewhere.
@@ -208,6 +200,16 @@ class Tracker:
     def warm(self) -> None:
         """Load and compile what the first call of ``follow`` would otherwise wait for."""
         self._locator.warm()
+
+
+def _judged(
+    estimate: Estimate, looks: Sequence[Look], strictly: bool, last: Estimate | None = None
+) -> Estimate:
+    start = time.perf_counter()
+    estimate = judged(estimate, looks, strictly)
+    if last is not None:
+        estimate = doubt_if_hidden(estimate, last)
+    return _timed(estimate, "judge", start)
 
 
 def _parted(
@@ -259,7 +261,8 @@ def _timed(estimate: Estimate, stage: str, start_s: float) -> Estimate:
     """The estimate with the duration of a stage in its report."""
     took_s, timings = time.perf_counter() - start_s, estimate.report.timings
     total_s = timings["total"] + took_s
-    return estimate.reporting(timings={**timings, stage: took_s, "total": total_s})
+    all_s = took_s + timings.get(stage, 0.0)
+    return estimate.reporting(timings={**timings, stage: all_s, "total": total_s})
 
 
 def _check_of(estimate: Estimate | None) -> str:

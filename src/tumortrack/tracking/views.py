@@ -33,7 +33,6 @@ from tumortrack.sense.files import (
 from tumortrack.sense.measured_noise import noise_of
 from tumortrack.sense.region import Hints, organ_points
 from tumortrack.sense.region.working_image import ORGAN, PIECES, STEPS, THIN, image_of_frame
-from tumortrack.sense.sensors import depth_error_of
 from tumortrack.tracking.options import LocateOptions
 
 NO_CLOUD = Path("-")
@@ -167,7 +166,7 @@ def read_views(paths: Sequence[Path], options: LocateOptions) -> list[View]:
             "it once, or once for each."
         )
     cameras = cameras if len(cameras) == count else cameras * count
-    stated = depth_error_of(options.depth_error)
+    stated = options.stated_error
     views = [_read_view(*pair, options) for pair in zip(paths, cameras, strict=True)]
     if stated is None:
         return views

@@ -144,7 +144,7 @@ def _scale(
 def correction(said: dict[str, Any]) -> dict[str, float]:
     """What intrinsics.json says of it: true = depth_scale * measured + depth_offset_mm, right to
     depth_left_mm."""
-    if "scale" not in said:  # too few poses to know what is left
+    if "scale" not in said:  # too few poses tell nothing of other distances
         return {}
     left = {"depth_left_mm": said["left_mm"]}
     if not said["corrected"]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.report import Finding
-from tumortrack.core.types import DepthError, DepthFrame, SensorCloud
+from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.sense.cloud import FEWEST_POINTS
 from tumortrack.sense.measured_noise import DepthNoise, image_noise
 from tumortrack.sense.noise import REFERENCE_MM
@@ -131,7 +131,7 @@ def organ_points(
             content.stamp_ns,
             None if noise is None else noise.of_points(count, image.window_px),
             image.points(beside),
-            _depth_error(content),
+            content.depth_error,
         )
 
     cloud = cloud_of(remaining)
@@ -190,12 +190,6 @@ def _noise_there(
 
 def _noise_where(frame: DepthFrame, there: np.ndarray) -> DepthNoise | None:
     return image_noise(frame.with_depth(np.where(there, frame.depth_mm, np.float32(np.nan))))
-
-
-def _depth_error(content: DepthFrame | SensorCloud) -> DepthError | None:
-    return (
-        content.intrinsics.depth_error if isinstance(content, DepthFrame) else content.depth_error
-    )
 
 
 def _pixels_of(image: WorkingImage, window: Any, mask: np.ndarray) -> np.ndarray:
