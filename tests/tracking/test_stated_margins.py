@@ -17,9 +17,14 @@ from tumortrack.core.errors import ArtifactError
 from tumortrack.core.report import MarginReport
 from tumortrack.core.types import SensorCloud
 from tumortrack.tracking import margins as stored
+from tumortrack.tracking import misses
 from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack.tracking.margins import ModelMargins, Radius, Shells, stated_margin, stated_radius
+from tumortrack.tracking.misses import MissModel
+from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.quality import with_margin
+from tumortrack.tracking.tracker import Tracker
+from warp_objects import ANATOMY, placed
 
 
 def _shells(confidence: float, factor: float) -> Shells:
@@ -179,3 +184,18 @@ def test_the_limits_of_an_estimate_are_those_of_its_group():
 
     assert judged(0).quality == judged(11).quality == "poor"
     assert (judged(12).quality, len(judged(12).report.margin.stated)) == ("good", 1)
+
+
+def test_a_weak_models_answer_states_no_margin(slim_model, monkeypatch):
+    sure = MissModel(fingerprint(), 0.0, {}, {})
+    monkeypatch.setattr(misses, "shipped", lambda: sure)
+    moved = placed(share=0.3).carry(ANATOMY.organ.vertices_mm)
+    cloud = SensorCloud(moved[((moved - moved.mean(0)) * moved).sum(1) < 0].astype(np.float32))
+    known = load_model(slim_model, "cpu")
+    stated = {}
+    for far in (0.0, 0.9):  # share of the scenes in which no answer was right
+        provenance = {**known.provenance, "validation_far": far}
+        model = dataclasses.replace(known, provenance=provenance, margins=MARGINS)
+        found = Tracker(model).locate(cloud, 16, 0)
+        stated[found.finding and found.finding.kind] = bool(found.report.margin.stated)
+    assert stated == {None: True, "model": False}
