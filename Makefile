@@ -149,7 +149,7 @@ pulls: setup  ## whether tumors that the holder pulls are cut out (ARGS="OUT CAS
 trust: setup  ## what margins are worth for kidneys and physics left out (ARGS="OUT"; an hour)
 	$(BIN)/python lab/scripts/trust.py $(ARGS)
 
-misses: setup  ## learns how far off tumors may be, from random kidneys (ARGS="OUT --write src/tumortrack/tracking/misses.json"; half an hour)
+misses: setup  ## learns how far off tumors may be, from random kidneys (ARGS="OUT --write src/tumortrack/assessment/misses.json"; half an hour)
 	$(BIN)/python lab/scripts/misses.py $(ARGS)
 
 evidence: setup  ## what touches, outlines, landmarks and held tumors bring, on random kidneys (ARGS="OUT --kidneys 4"; 10 minutes)

@@ -73,7 +73,7 @@ def record(locate: Callable[[], Estimate], points_mm: np.ndarray) -> Numbers:
     assert estimate.motion is not None
     places = [estimate.motion.carry(organ[:: len(organ) // PLACES][:PLACES])]
     places += [[part.center_mm] for part in report.tumors.values() if part.center_mm]
-    bounds = {name: part.miss_mm for name, part in report.tumors.items() if part.miss_mm}
+    bounds = {name: each.error_bound95_mm for name, each in estimate.assessment.bounds.items()}
     return {
         **numbers,
         "places_mm": np.round(np.concatenate(places), 3).tolist(),

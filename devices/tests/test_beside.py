@@ -18,6 +18,7 @@ from clock import until
 from igtl_objects import hear_all
 from live_objects import STAMP_NS, empty_update, small_setting, small_update
 from motions import Wave
+from reports import advised as with_advice
 from reports import reporting
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.report import Finding
@@ -79,8 +80,8 @@ def told(
         {"name": name, "off_mm": 1.0, "news": 0.5, "left_out": out, "places_mm": [place]}
         for name, (place, out) in evidence.items()
     ]
-    entries = {"next_evidence": advice if advised else [], "evidence": pieces}
-    estimate = reporting(update.estimate, **entries)
+    estimate = reporting(update.estimate, evidence=pieces)
+    estimate = with_advice(estimate, advice if advised else [])
     return replace(update, estimate=replace(estimate, motion=motion))
 
 

@@ -184,7 +184,7 @@ def test_margins_and_deviations_come_with_the_tumors(opened) -> None:
     update = small_update()
     assert update.estimate is not None
     stated = {"stated": [{"confidence": 0.95, "mm": {"tumor_1": 5.0}}]}
-    sure = reporting(update.estimate, margin=stated, parts={"tumor_1": {"miss_mm": 1.26}})
+    sure = reporting(bounded(update.estimate, tumor_1=5.04), margin=stated)
     sure = replace(sure, motion=Wave(sure=True))
     sink.publish(replace(update, estimate=sure))
     heard = hear_all(sock, ALL + 1)  # the margin
@@ -201,7 +201,7 @@ def test_margins_and_deviations_come_with_the_tumors(opened) -> None:
     finally:
         client.stop()
     assert points.names == [
-        "tumor_1, 95 % within 1.3 mm, 95 % margin 5.0 mm", "tumor_2, no margin stated",
+        "tumor_1, off by at most 5.0 mm (95 %)", "tumor_2",
     ]  # fmt: skip
     np.testing.assert_allclose(points.positions, [[-14, 3, 120], [6, -5, 138]], atol=1e-4)
     sink.publish(update)

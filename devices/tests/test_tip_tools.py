@@ -19,8 +19,8 @@ import needs
 from clock import until
 from live_objects import STAMP_NS, small_anatomy, small_estimate, small_frame, small_setting
 from rtde_arm import RtdeArm
+from tumortrack.core.assessment import NOT_JUDGED
 from tumortrack.core.errors import InputError
-from tumortrack.core.estimate import NOT_JUDGED
 from tumortrack.core.evidence import Free, Held, Landmark, Outline, Touch
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.live.poses import COLUMNS, CONTACT, pose_row
@@ -178,7 +178,7 @@ class Shifted:
 
 
 def found(shift_mm, finding=None):
-    return replace(small_estimate(), motion=Shifted(shift_mm), finding=finding)
+    return replace(small_estimate(), motion=Shifted(shift_mm)).assessed(finding=finding)
 
 
 def test_what_is_held_is_the_point_of_the_ct_that_was_taken_until_it_is_let_go(tmp_path):

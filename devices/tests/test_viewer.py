@@ -18,7 +18,7 @@ from scipy.stats import chi2
 
 from clock import Clock, until
 from live_objects import PARTS, ball, empty_update, small_anatomy, small_setting, small_update
-from reports import reporting
+from reports import bounded, reporting
 from tumortrack.core.colours import ENERGISED, TUMORS, part_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
@@ -586,8 +586,7 @@ def test_status_says_why_and_no_old_numbers():
     assert "3.2 s" in stale.stage()
     sure = small_update()
     assert sure.estimate is not None
-    stated = reporting(sure.estimate, parts={"tumor_1": {"miss_mm": 1.84}})
-    sure = replace(sure, estimate=stated)
+    sure = replace(sure, estimate=bounded(sure.estimate, tumor_1=1.84))
     good = StatusPanel("good", sure, 0.1, 8, parts=PARTS).numbers()
     assert "off by at most (95 %)" in good
     assert "tumor 1</td><td>0.9 ml</td><td>1.8 mm</td>" in good

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from browser import Browser, of_first_tumor
 from clock import until
 from live_objects import empty_update, small_setting, small_update
-from reports import reporting
+from reports import bounded, reporting
 from stories import COMMAND, environment, live_resection
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
@@ -196,10 +196,10 @@ def test_banner_and_panel_leave_room_for_each_other_at_every_size():
     """On a phone, a laptop and a large screen, with a reason longer than any. What lies below the
     numbers does not jump."""
     shown = small_update()
-    sure = {name: {"center_std_mm": 1.1, "miss_mm": 1.9} for name in ("tumor_1", "tumor_2")}
     touch = {"name": "touch", "off_mm": 0.1, "news": 0.2, "left_out": False}
+    sure = bounded(shown.estimate, tumor_1=1.9, tumor_2=1.9)
     states = {
-        "GOOD": replace(shown, estimate=reporting(shown.estimate, parts=sure, evidence=[touch])),
+        "GOOD": replace(shown, estimate=reporting(sure, evidence=[touch])),
         "POOR": replace(shown, quality="poor", warning=LONGEST),
         "NONE": replace(shown, estimate=None, quality="none", reason=LONGEST),
     }

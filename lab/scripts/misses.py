@@ -3,7 +3,7 @@
     make misses ARGS='OUT --kidneys 16'     (about half an hour on two cores)
 
 Makes kidneys, their models and scenes in OUT, locates each scene, from its cloud alone and with its
-depth image, and fits ``tracking.misses`` to how far off the tumors are; writes it to ``--write``.
+depth image, and fits ``assessment.bound`` to how far off the tumors are; writes it to ``--write``.
 Prints, or fills in a document's block, what it is worth for kidneys, and families of physics, that
 were left out. The same command goes on where it was stopped. No patient's anatomy is in it.
 """
@@ -48,7 +48,7 @@ class Options:
     seed: int = 1
     """Of everything."""
     write: Path | None = None
-    """File for what was learned: src/tumortrack/tracking/misses.json."""
+    """File for what was learned: src/tumortrack/assessment/misses.json."""
     document: Path | None = None
     """A page that shows the tables, which go beside it."""
 

@@ -8,6 +8,7 @@ from msgspec.structs import replace
 
 from live_objects import CAMERA, small_anatomy, small_estimate
 from reports import looked, reporting
+from tumortrack.assessment.verdict import judged
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import SensorCloud
@@ -16,7 +17,6 @@ from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack.tracking.margins import ModelMargins, evidence_words
-from tumortrack.tracking.quality import judged
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.margins.calibration import (
     Listed,

@@ -162,7 +162,7 @@ def test_a_stated_margin_pays_for_an_estimate_that_is_as_far_off(case):
 
     def locate(scene, grid):
         estimate = off.locate(scene, grid)
-        return replace(estimate, finding=None).reporting(margin=stated)
+        return estimate.assessed(finding=None).reporting(margin=stated)
 
     rows = cut_one(case, replace(off, locate=locate), "D0", "noise", 64)
     assert all(row["good"] for row in rows)

@@ -12,11 +12,11 @@ import pandas as pd
 import pytest
 import trimesh
 
+from tumortrack.assessment.bound import POOR_MM
 from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.types import Mesh
 from tumortrack.tracking import model_files
-from tumortrack.tracking.misses import POOR_MM
 from tumortrack_lab.fleet import checks, results
 from tumortrack_lab.fleet.engine import run
 from tumortrack_lab.fleet.executors import Serial

@@ -279,8 +279,12 @@ def test_estimates_are_held_against_truth_and_rigid_pose_once_and_wrong_ones_nam
         carry=lambda points: transform_points(shift @ made.bench_from_ct, points),
         std_mm=lambda points: np.ones(len(points)),
     )
-    told = report_of(parts={"kidney": {}, "tumor_1": {"miss_mm": 3.0}})
-    answer, asked = SimpleNamespace(quality="good", reason="", motion=motion, report=told), []
+    told = report_of(parts={"kidney": {}, "tumor_1": {}})
+    said = Assessment(bounds={"tumor_1": ErrorBound(3.0)})
+    answer, asked = (
+        SimpleNamespace(quality="good", reason="", motion=motion, report=told, assessment=said),
+        [],
+    )
     monkeypatch.setattr(Tracker, "follow", lambda _, cloud, seen: asked.append(cloud) or answer)
     monkeypatch.setattr(estimates, "load_model", lambda *args, **how: None)
     monkeypatch.setattr(estimates, "Tracker", lambda model: Tracker.__new__(Tracker))

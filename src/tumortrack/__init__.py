@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from tumortrack.api import *  # noqa: F403
+    from tumortrack.assessment.advice import advise as advise
     from tumortrack.core import errors as errors
     from tumortrack.core.estimate import Estimate as Estimate
     from tumortrack.core.evidence import Free as Free
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
     from tumortrack.imaging.case import load_case as load_case
     from tumortrack.report.inspection import describe as describe
     from tumortrack.tracking import presets as presets
-    from tumortrack.tracking.advice import advise as advise
     from tumortrack.tracking.tracker import Tracker as Tracker
 
 _NAMES = {  # by the module that has them
@@ -42,7 +42,7 @@ _NAMES = {  # by the module that has them
     "core.types": "DepthFrame Intrinsics Look SensorCloud",
     "imaging.case": "Case load_case",
     "report.inspection": "describe",
-    "tracking.advice": "advise",
+    "assessment.advice": "advise",
     "tracking.tracker": "Tracker",
     "tracking": "presets",
 }

@@ -506,7 +506,7 @@ def estimate_from_surfaces(surfaces: Mapping[str, Mesh], grid: int = 160) -> Est
     """
     from tumortrack.models.report import estimate_of
 
-    return replace(estimate_of(dict(surfaces), grid), finding=None)
+    return estimate_of(dict(surfaces), grid).assessed(finding=None)
 
 
 def evaluate(

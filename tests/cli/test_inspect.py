@@ -22,16 +22,18 @@ from tumortrack.sense.ply import write_cloud_ply
 
 PATIENT = {"id": "P1", "side": "left"}
 PARTS = {
-    "kidney": {"label": 1, "found": True, "volume_ml": 180.06, "center_mm": [1.0, -2.04, 150.0],
-               "miss_mm": 2.84},
+    "kidney": {"label": 1, "found": True, "volume_ml": 180.06, "center_mm": [1.0, -2.04, 150.0]},
     "tumor_1": {"label": 2, "found": False},
 }  # fmt: skip
 RUN = {
     "quality": {"verdict": "poor", "reason": "the fit is worse than usual; look from elsewhere"},
+    "assessment": {"bounds": {"kidney": {"error_bound95_mm": 2.84}}},
     "patient": PATIENT,
     "parts": PARTS,
     "margin": {"stated": [], "reason": "a poor estimate has no margin"},
 }
+GOOD = {**RUN, "quality": {"verdict": "good", "reason": ""},
+        "assessment": {**RUN["assessment"], "finding": None}}  # fmt: skip
 TRACK = {
     "patient": PATIENT, "source": "virtual:CASE", "seconds": 10.0, "updates": 200,
     "sinks": {"viewer": {"delivered": 199, "dropped": 1}},
@@ -66,7 +68,7 @@ def say(path: Path) -> str:
         (RUN, ("a report of `locate`", "verdict: poor", 
                "kidney: centre (1.0, -2.0, 150.0) mm, 180.1 ml", "tumor_1: not found",
                "a poor estimate has no margin")),
-        ({**RUN, "quality": {"verdict": "good", "reason": ""}},
+        (GOOD,
          ("verdict: good", "kidney: centre (1.0, -2.0, 150.0) mm, off by at most 2.8 mm (95 %)")),
         ({"quality": {"verdict": "none", "reason": "only 3 points are left"}, "input": []},
          ("a report of `locate`", "verdict: none", "because only 3 points are left")),
@@ -96,8 +98,7 @@ def test_the_verdict_comes_first_and_its_reason_next(tmp_path):
         "  verdict: poor.",
         "  because the fit is worse than usual; look from elsewhere.",
     ]
-    good = {**RUN, "quality": {"verdict": "good", "reason": ""}}
-    store.write_json(tmp_path / "report.json", good)
+    store.write_json(tmp_path / "report.json", GOOD)
     assert describe(tmp_path)[1:3] == ["  verdict: good.", "  patient P1, side left."]
 
 

@@ -13,7 +13,7 @@ import tumortrack as tt
 from depth_files import write_frame_folder
 from live_objects import ball, small_estimate
 from region_objects import ORGAN, Props, make_scene
-from reports import reporting
+from reports import advised, reporting
 from stories import answered, refusal, tumortrack
 from tumortrack.cli.main import run
 from tumortrack.core import colours
@@ -90,7 +90,7 @@ def test_the_organ_is_found_in_a_raw_depth_image(raw, clinic_model, phantom_case
     assert f"<h1>{report['quality']['verdict'].upper()}</h1>" in page
     assert "No margin: the model was not calibrated" in page
     assert report["quality"]["verdict"] == "good"  # a poor one's bound would not be shown
-    assert f"{report['parts']['tumor_1']['miss_mm']:.1f} mm" in page
+    assert f"{report['assessment']['bounds']['tumor_1']['error_bound95_mm']:.1f} mm" in page
     with Image.open(raw / "run" / PICTURE) as picture:
         assert picture.width == 2200
 
@@ -236,9 +236,9 @@ def test_the_page_shows_evidence_and_what_to_learn_next_where_the_organ_surely_l
         }
         for kind in ("touch", "touch", "touch", "look")
     ]  # fmt: skip
-    estimate = reporting(small_estimate(), evidence=known, next_evidence=advice)
+    estimate = advised(reporting(small_estimate(), evidence=known), advice)
     rival = Finding("rival", {"part": "tumor_1", "apart_mm": 9.0})
-    estimate = replace(estimate, finding=None if placed else rival)
+    estimate = estimate.assessed(finding=None if placed else rival)
     write_run_page(tmp_path, {}, estimate, Seen())
     page = (tmp_path / PAGE).read_text()
     for cells in (

@@ -7,11 +7,11 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, ndtri
 
+from tumortrack.assessment.verdict import _within
 from tumortrack.core.geometry import turned_by
 from tumortrack.registration import kernels
 from tumortrack.registration.locator import nearest_lookup
 from tumortrack.sense.kernels import _QUANTILES
-from tumortrack.tracking.quality import _within
 
 
 @pytest.mark.parametrize("length", [0.0, 1e-9, 0.3, np.pi, 5.0])

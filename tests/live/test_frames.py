@@ -37,7 +37,7 @@ class Located(Tracker):
         if verdict == "none":
             raise NoEstimate("it does not look like this organ")
         estimate = small_estimate(cloud.stamp_ns)
-        return replace(estimate, finding=None if verdict == "good" else poor("it is doubtful"))
+        return estimate.assessed(finding=None if verdict == "good" else poor("it is doubtful"))
 
 
 class Frames(SourceWorker):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -372,7 +371,7 @@ def test_only_an_organ_found_good_a_moment_ago_may_have_been_turned_over(tracker
         def follow(self, cloud, last=None, how=FollowOptions(), seen=None, evidence=()):  # noqa: B008
             asked.append(how.either_side)
             found = super().follow(cloud, last, how, seen, evidence)
-            return replace(found, finding=None if verdicts.pop(0) == "good" else poor("hidden"))
+            return found.assessed(finding=None if verdicts.pop(0) == "good" else poor("hidden"))
 
     asked, verdicts = [], ["poor", "good", "poor", "poor", "poor", "poor"]
     follower = Follower(Watched(tracker.model), FollowerConfig())

@@ -204,7 +204,7 @@ def test_an_answer_that_is_far_off_has_failed_however_it_is_called(tmp_path):
         scene().write(tmp_path / "scenes" / name)
     answers = {name: estimate_of(anatomy((x, 0, 0))) for name, x in shifts_mm.items()}
     for name in ("near", "far"):
-        answers[name] = replace(answers[name], finding=None)
+        answers[name] = answers[name].assessed(finding=None)
     locate = Scripted(*(answers[name] for name in sorted(answers)))
     report = evaluate_scenes(locate, tmp_path / "scenes", tmp_path / "out")
     failed = {entry["name"]: entry["failed"] for entry in report["scenes"]}

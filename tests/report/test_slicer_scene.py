@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import clients
 from imaging_objects import kidney_labels
 from live_objects import small_estimate
-from reports import NOWHERE, reporting
+from reports import NOWHERE, bounded, reporting
 from tumortrack.cli.cases import Export
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
@@ -46,8 +46,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     parts, left = surfaces(labels)[0], Patient("P1", "left")
     save_case(Case(parts, labels, (0.0, -1.0, 0.0), ct=ct, patient=left), top / "case")
     found = reporting(
-        replace(small_estimate(), finding=None),
-        parts={"tumor_1": {"miss_mm": 1.26}},
+        bounded(small_estimate(), tumor_1=5.04),
         motion={**NOWHERE, "camera_from_ct": CAMERA_FROM_CT.tolist()},
         margin={"stated": [{"confidence": 0.95, "mm": {"tumor_1": 5.0}}]},
     )

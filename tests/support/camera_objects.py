@@ -69,7 +69,7 @@ class Located(Tracker):
     def follow(self, cloud, last=None, how=None, seen=None, evidence=()):
         self.asked.append((last, evidence))
         estimate = small_estimate(cloud.stamp_ns)
-        return replace(estimate, finding=None)
+        return estimate.assessed(finding=None)
 
 
 def played(sources, places, published=None, tracker=None):

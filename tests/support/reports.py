@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import msgspec
 import numpy as np
 
+from tumortrack.core.assessment import ErrorBound
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import HERE
-from tumortrack.core.report import Finding, FitReport
+from tumortrack.core.report import Finding, FitReport, NextEvidence
 from tumortrack.core.types import DepthFrame, Look, SensorCloud
 
 NOWHERE = {
@@ -33,6 +35,17 @@ def reporting(estimate: Estimate, **entries: Any) -> Estimate:
     for name, part in entries.pop("parts", {}).items():
         parts[name] = {**parts.get(name, {}), **part}
     return replace(estimate, report=report_of(**{**known, "parts": parts, **entries}))
+
+
+def advised(estimate: Estimate, advice: Sequence[dict[str, Any]]) -> Estimate:
+    """The same estimate with this advice, as in report.json."""
+    return estimate.assessed(next_evidence=msgspec.convert(advice, tuple[NextEvidence, ...]))
+
+
+def bounded(estimate: Estimate, **bounds_mm: float) -> Estimate:
+    """The same estimate, good, and its parts off by at most so much."""
+    bounds = {name: ErrorBound(mm) for name, mm in bounds_mm.items()}
+    return estimate.assessed(finding=None, bounds=bounds)
 
 
 def looked(seen: DepthFrame | SensorCloud) -> list[Look]:

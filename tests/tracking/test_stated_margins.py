@@ -12,6 +12,7 @@ from msgspec.structs import replace
 
 from live_objects import small_estimate
 from reports import NOWHERE, poor, report_of, reporting
+from tumortrack.assessment.bound import MissModel
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError
 from tumortrack.core.report import MarginReport
@@ -19,10 +20,15 @@ from tumortrack.core.types import SensorCloud
 from tumortrack.tracking import margins as stored
 from tumortrack.tracking import misses
 from tumortrack.tracking.fingerprint import fingerprint
-from tumortrack.tracking.margins import ModelMargins, Radius, Shells, stated_margin, stated_radius
-from tumortrack.tracking.misses import MissModel
+from tumortrack.tracking.margins import (
+    ModelMargins,
+    Radius,
+    Shells,
+    stated_margin,
+    stated_radius,
+    with_margin,
+)
 from tumortrack.tracking.model_files import load_model
-from tumortrack.tracking.quality import with_margin
 from tumortrack.tracking.tracker import Tracker
 from warp_objects import ANATOMY, placed
 
@@ -82,7 +88,7 @@ def test_an_estimate_beyond_a_limit_is_poor_and_says_which():
     rare = replace(MARGINS, limits={"rarity": 1.0, "unseen": 0.5})
 
     def judged(rarity, cloud, finding=None):
-        estimate = dataclasses.replace(small_estimate(), finding=finding)
+        estimate = small_estimate().assessed(finding=finding)
         parts = {name: {"surface_std_mm": 1.0} for name in estimate.report.parts}
         estimate = reporting(estimate, parts=parts, motion={**NOWHERE, "rarity": rarity})
         return with_margin(estimate, cloud, rare)
@@ -99,7 +105,7 @@ def test_an_estimate_beyond_a_limit_is_poor_and_says_which():
     assert "unseen is 0." in judged(0.9, end).reason  # worked out here: an image was judged
     before = judged(0.9, whole, poor("it is hidden"))
     assert before.report.margin == MarginReport(reason="a poor estimate has no margin")
-    without = with_margin(dataclasses.replace(small_estimate(), finding=None), whole, None)
+    without = with_margin(small_estimate().assessed(finding=None), whole, None)
     assert without.quality == "good"
     assert without.report.margin.reason.startswith("the model was not calibrated")
 
@@ -171,7 +177,7 @@ def test_margins_with_evidence_are_kept_beside_those_of_clouds_alone(tmp_path):
 
 def test_the_limits_of_an_estimate_are_those_of_its_group():
     def judged(touches):
-        estimate = dataclasses.replace(small_estimate(), finding=None)
+        estimate = small_estimate().assessed(finding=None)
         parts = {name: {"surface_std_mm": 1.0} for name in estimate.report.parts}
         pieces = msgspec.to_builtins(_using(touch=touches).evidence)
         estimate = reporting(

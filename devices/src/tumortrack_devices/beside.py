@@ -68,7 +68,7 @@ class Beside:
         if estimate is None or motion is None:
             self._advice = []
             return ()
-        if new := [each for each in estimate.report.next_evidence if each.kind == "touch"]:
+        if new := [each for each in estimate.assessment.next_evidence if each.kind == "touch"]:
             points_ct = motion.back(np.array([each.place_mm for each in new]))
             if points_ct is not None:
                 self._advice, self._points_ct = new, points_ct

@@ -88,7 +88,7 @@ def _say_estimate(estimate: Estimate, located: Located) -> None:
     report, margin = estimate.report, estimate.report.margin
     say(verdict_words(estimate.quality, estimate.reason))
     say(str(estimate.patient))
-    for row in part_rows(report, estimate.quality == "good"):
+    for row in part_rows(report, estimate.assessment):
         say(row_words(row))
     if margin is None or not margin.stated:
         say(margin_words(margin))

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import msgspec
 import numpy as np
 from jaxtyping import Float
 
+from tumortrack.core.assessment import Assessment, Quality
 from tumortrack.core.config import Config, check_seed
 from tumortrack.core.errors import InputError
 from tumortrack.core.evidence import Evidence
@@ -20,11 +21,9 @@ from tumortrack.core.report import Finding, FitReport, Likely
 from tumortrack.core.types import CameraLabels, Mesh, OccupancyCloud
 
 LARGEST_GRID = 400
-Quality = Literal["good", "poor", "none"]  # none: there is no estimate
 FAR_MM = 5.0  # an answer with a tumor's centre farther off has failed: a plan's whole usual margin
 # Shown beside "good", which alone would claim more than is known.
 NO_CHECK_FAILED, UNVERIFIED = "no check failed", "its place is not verified"
-NOT_JUDGED = Finding("not_judged")
 
 
 def verdict_words(verdict: Quality, reason: str) -> str:
@@ -91,9 +90,7 @@ class Estimate:
         report: figures: per part volume, centre, box and probability, the fit's cost, ...
         motion: None if the method knows none. ``unsmoothed``: the same before the mean over past
             frames; the next frame's search starts there.
-        finding: why it is poor (see ``tracking.quality.judged``); None: it is good.
-        causes: of a poor one, the likeliest first: see ``tracking.causes``.
-        advice: sentences after the finding's: what probably happened and what to do.
+        assessment: how far off the parts may be, whether it is good, and what to do if not.
         patient: of the model; nothing verifies that this is what the camera sees.
         structures: other surfaces of the CT that move with it, by name; empty without a motion.
         evidence: what is known beside the cloud, for the next frame.
@@ -105,9 +102,7 @@ class Estimate:
     report: FitReport
     motion: Motion | None = None
     unsmoothed: Motion | None = None
-    finding: Finding | None = NOT_JUDGED
-    causes: tuple[Likely, ...] = ()
-    advice: str = ""
+    assessment: Assessment = field(default_factory=Assessment)
     patient: Patient = NOBODY
     organ: Organ = KIDNEY
     structures: Mapping[str, Mesh] = field(default_factory=dict)
@@ -118,25 +113,35 @@ class Estimate:
         lines = [verdict_words(self.quality, self.reason)]
         for name, part in self.report.parts.items():
             middle = None if part.center_mm is None else [round(n, 1) for n in part.center_mm]
-            miss = "" if part.miss_mm is None else f", miss_mm={part.miss_mm:.1f}"
-            lines.append(
-                f"{name}: center_mm={middle}{miss}" if part.found else f"{name}: not found"
-            )
+            bound = self.assessment.bound_words(name)
+            where = f"center_mm={middle}{bound and f', {bound}'}" if part.found else "not found"
+            lines.append(f"{name}: {where}")
         frame = f"{len(self.cloud.points_mm)} points; camera frame: x right, y down, z forward, mm"
         return "\n".join([f"Estimate: {lines[0]}", *lines[1:], frame])
 
     @property
+    def finding(self) -> Finding | None:
+        return self.assessment.finding
+
+    @property
+    def causes(self) -> tuple[Likely, ...]:
+        return self.assessment.causes
+
+    @property
     def quality(self) -> Quality:
-        return "good" if self.finding is None else "poor"
+        return self.assessment.quality
 
     @property
     def reason(self) -> str:
-        """Why it is poor and what to do; empty: it is good."""
-        return "" if self.finding is None else self.finding.words + self.advice
+        return self.assessment.reason
 
     @property
     def organ_mesh(self) -> Mesh:
         return next(iter(self.meshes.values()))
+
+    def assessed(self, **changes: Any) -> Estimate:
+        """The same estimate with these fields of its assessment replaced."""
+        return replace(self, assessment=msgspec.structs.replace(self.assessment, **changes))
 
     def reporting(self, **changes: Any) -> Estimate:
         """The same estimate with these fields of its report replaced."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 import string
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import Enum
+from enum import StrEnum, auto
 from typing import Any, Literal
 
 import msgspec
@@ -52,9 +52,6 @@ class _Said(msgspec.Struct, forbid_unknown_fields=True):
 _SAID = read_table("tumortrack.core", "findings.toml", _Said)
 
 
-_NOT_STORED = {"limit_mm": 6.0, "digits": "1"}  # by runs of before
-
-
 class _WithoutNumbers(string.Formatter):
     """Writes # for every number."""
 
@@ -80,13 +77,12 @@ class Finding(msgspec.Struct, frozen=True):
 
     @property
     def words(self) -> str:
-        return self._sentence.format(**{**_NOT_STORED, **self.values})
+        return self._sentence.format(**self.values)
 
     @property
     def words_without_numbers(self) -> str:
         """For counts of what happened often."""
-        values = {**_NOT_STORED, **self.values}
-        return _WithoutNumbers().vformat(self._sentence, (), values)
+        return _WithoutNumbers().vformat(self._sentence, (), self.values)
 
     @property
     def same_as(self) -> tuple[Kind, object]:
@@ -107,8 +103,7 @@ class PartReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     ``center_axes_std_mm``, the least sure first; ``nearest_mm``: from the centre to the nearest
     point that was seen; ``held_by_prior_mm``: how far the elastic prior, against the points, holds
     the centre; ``fit_std_mm``: the largest deviations of centre and surface without the camera's
-    common error; ``miss_mm``: within which 95 % of such tumors' centres lie, as learned from
-    simulated kidneys. None: not found, or the method does not know."""
+    common error. None: not found, or the method does not know."""
 
     label: int
     found: bool
@@ -124,12 +119,6 @@ class PartReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     nearest_mm: float | None = None
     held_by_prior_mm: float | None = None
     fit_std_mm: tuple[float, float] | None = None
-    miss_mm: float | None = None
-
-    @property
-    def bound_words(self) -> str:
-        """Within how far of where it is shown its centre lies (95 %); empty: not known."""
-        return "" if self.miss_mm is None else f"{self.miss_mm:.1f} mm"
 
 
 class Residuals(_Value, frozen=True, kw_only=True):
@@ -299,7 +288,6 @@ class FitReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     motion: MotionReport | None = None
     looks: LooksReport | None = None
     evidence: tuple[EvidenceReport, ...] = ()
-    next_evidence: tuple[NextEvidence, ...] = ()
     fit_mm: Residuals | None = None
     timings: dict[str, float] = {}
     unseen: float | None = None
@@ -318,12 +306,22 @@ class FitReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
         return dict(list(self.parts.items())[1:])
 
 
-# Of a poor estimate, or of none.
-Cause = Enum(
-    "Cause",
-    "UNIT FRAME MIRRORED SCALE OBJECT BACKGROUND HIDDEN ANOTHER_PATIENT DEFORMED POSES VIEW "
-    "EVIDENCE NOISE",
-)
+class Cause(StrEnum):
+    """Of a poor estimate, or of none."""
+
+    UNIT = auto()
+    FRAME = auto()
+    MIRRORED = auto()
+    SCALE = auto()
+    OBJECT = auto()
+    BACKGROUND = auto()
+    HIDDEN = auto()
+    ANOTHER_PATIENT = auto()
+    DEFORMED = auto()
+    POSES = auto()
+    VIEW = auto()
+    EVIDENCE = auto()
+    NOISE = auto()
 
 
 @dataclass(frozen=True)
@@ -335,6 +333,3 @@ class Likely:
     cause: Cause
     number: float | None = None
     fit: float | None = None
-
-    def entry(self) -> dict[str, Any]:
-        return {"cause": self.cause.name.lower(), "number": self.number, "fit": self.fit}

@@ -20,7 +20,7 @@ from typing import Any
 import tumortrack
 from tumortrack.core.errors import ArtifactError, InputError, StorageError
 
-SCHEMA = 4  # raise it with every change of a folder's content or of what its numbers depend on
+SCHEMA = 5  # raise it with every change of a folder's content or of what its numbers depend on
 _MADE_BY = {  # by kind
     "case": "prepare INPUT CASE",
     "twin": "twin CASE SCENES",

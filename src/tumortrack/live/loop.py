@@ -17,9 +17,10 @@ from typing import Any
 
 import numpy as np
 
+from tumortrack.core.assessment import Quality
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
-from tumortrack.core.estimate import Estimate, Quality
+from tumortrack.core.estimate import Estimate
 from tumortrack.core.evidence import Evidence
 from tumortrack.core.halt import Halt
 from tumortrack.core.report import Finding

@@ -20,9 +20,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt8
 
+from tumortrack.core.assessment import ErrorBound, Quality
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate, Quality
+from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate
 from tumortrack.core.evidence import Evidence
 from tumortrack.core.geometry import Affine, rigid, transform_points
 from tumortrack.core.halt import Halt
@@ -284,6 +285,13 @@ class TrackingResult:
         )
         points_mm = transform_points(pose, cloud.points_mm)
         return TransformedEstimate(points_mm, cloud.labels, cloud.probability, meshes, structures)
+
+    @property
+    def bounds(self) -> Mapping[str, ErrorBound]:
+        """How far off each part is at most; of a good answer, as far as it is known."""
+        if self.estimate is None or self.quality != "good":
+            return {}
+        return self.estimate.assessment.bounds
 
     @property
     def camera_views(self) -> tuple[CameraView, ...]:

@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32, Int32, Int64, UInt8
 from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.evidence import FEWEST_TOUCHES, Evidence
 from tumortrack.core.geometry import largest_std_of
-from tumortrack.core.report import EvidenceReport, FitReport, SizeFit, SmoothingReport
+from tumortrack.core.report import EvidenceReport, FitReport, NextEvidence, SizeFit, SmoothingReport
 from tumortrack.core.types import (
     Anatomy,
     CameraLabels,
@@ -165,12 +165,14 @@ class RegistrationLocator:
         prior, more = self._registration.prior, {"size": size, "voxel_mm": voxel_mm}
         found = self._found(fit, prior=self._registration.prior, pieces=tuple(evidence))
         said, known = self._evidence_report(placed, found)
+        advice: tuple[NextEvidence, ...] = ()
         if len(self._model.parts) > 1:
             advisor = self._advisor(placed)
-            more["next_evidence"] = *advisor.touches(), *advisor.others()
+            advice = *advisor.touches(), *advisor.others()
         report = self._report(frame, looks, placed, inside, prior, evidence=said, **more)
         volume = CameraLabels(labels, camera_from_index)
         made = Estimate(inside, volume, placed.meshes, report, placed.motion, found.shown)
+        made = made.assessed(next_evidence=advice)
         return replace(made, structures=placed.structures, evidence=known)
 
     def follow(self, looks: Sequence[Look], last: Estimate | None, how: FollowOptions) -> Estimate:
@@ -190,11 +192,13 @@ class RegistrationLocator:
         smoothing = SmoothingReport(time_s=how.smoothing_s, lag_ms=1000 * lag_s)
         said, known = self._evidence_report(placed, found)
         more = {"size": size, "smoothing": smoothing, "evidence": said}
+        advice: tuple[NextEvidence, ...] = ()
         if how.thorough and len(self._model.parts) > 1:
             with frame.stage("advise"):
-                more["next_evidence"] = self._advisor(placed).touches()
+                advice = self._advisor(placed).touches()
         report = self._report(frame, looks, placed, inside, found.prior, **more)
         made = Estimate(inside, None, placed.meshes, report, placed.motion, found.shown)
+        made = made.assessed(next_evidence=advice)
         return replace(made, structures=placed.structures, evidence=known)
 
     def _advisor(self, placed: _Placed) -> Advisor:

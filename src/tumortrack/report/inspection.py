@@ -107,13 +107,15 @@ def _with_figures(content: Content, folder: Path) -> Content:
     elif content.keys() >= {"quality", "parts"}:
         import msgspec
 
+        from tumortrack.core.assessment import Assessment
         from tumortrack.core.report import FitReport
         from tumortrack.report.seen import part_rows, row_words
         from tumortrack.tracking.margins import margin_words
 
-        report, good = msgspec.convert(content, FitReport), content["quality"]["verdict"] == "good"
+        report = msgspec.convert(content, FitReport)
+        assessment = msgspec.convert(content.get("assessment", {}), Assessment)
         figures["margin_words"] = margin_words(report.margin)
-        figures["rows"] = [row_words(row) for row in part_rows(report, good)]
+        figures["rows"] = [row_words(row) for row in part_rows(report, assessment)]
     elif "updates" in content:
         counts = *content["estimates"].values(), content["no_estimate"]
         figures["share"] = [count / max(sum(counts), 1) for count in counts]

@@ -8,12 +8,12 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tumortrack.assessment.bound import depths_within_mm
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.evidence import read_evidence
 from tumortrack.report.seen import Seen
-from tumortrack.tracking.misses import depths_within_mm
 from tumortrack.tracking.options import LocateOptions, check_grid, model_folder
 from tumortrack.tracking.points import PointTable, check_near_organ, read_points
 from tumortrack.tracking.views import (
@@ -190,7 +190,8 @@ def _no_estimate(
         **report_head(view.content.stamp_ns),
         "seed": options.seed,
         "patient": to_builtins(model.patient),
-        "quality": {"verdict": "none", "reason": reason, "finding": finding_entry(error.finding)},
+        "quality": {"verdict": "none", "reason": reason},
+        "assessment": {"finding": finding_entry(error.finding)},
     }
 
 

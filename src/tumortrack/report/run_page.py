@@ -19,7 +19,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from tumortrack.core import colours
-from tumortrack.core.estimate import Estimate, Quality, verdict_words
+from tumortrack.core.assessment import Quality
+from tumortrack.core.estimate import Estimate, verdict_words
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.organ import is_tumor
 from tumortrack.core.patient import patient_in
@@ -45,7 +46,7 @@ _MOST_TUMORS = 6  # with slices
 _NEAR_MM = 1.0  # points this near to a slice are shown in it
 _BAR_MM = 20.0
 _TITLES = {"good": "GOOD", "poor": "POOR", "none": "NONE: no estimate"}
-_TABLE_TITLES = {"part": "", "centre": "centre (x, y, z)", "bound": "off by at most (95 %)"}
+_TABLE_TITLES = {"part": "", "centre": "centre (x, y, z)", "bound": "bound"}
 Panel = tuple[str, Image.Image]  # with its caption
 
 
@@ -61,7 +62,7 @@ def write_run_page(
     slices = [] if estimate is None else list(_slices(estimate, seen))
     reason = report["quality"]["reason"] if estimate is None else estimate.reason
     words = verdict_words(verdict, reason)
-    rows = [] if estimate is None else part_rows(estimate.report, estimate.quality == "good")
+    rows = [] if estimate is None else part_rows(estimate.report, estimate.assessment)
     known = [] if estimate is None else _evidence_rows(estimate)
     lines = list(_lines(report, estimate))
     picture = _picture(verdict, [words, *lines, *map(row_words, rows)], views + slices)

@@ -14,6 +14,7 @@ from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.tracking.margins import stated_radius
 
 if TYPE_CHECKING:
+    from tumortrack.core.assessment import Assessment
     from tumortrack.core.estimate import Estimate
     from tumortrack.tracking.slices import CarriedCt
 
@@ -37,7 +38,7 @@ class Seen:
     ct: CarriedCt | None = None
 
 
-def part_rows(report: FitReport, good: bool) -> list[dict[str, str]]:
+def part_rows(report: FitReport, assessment: Assessment) -> list[dict[str, str]]:
     """For each part its name, centre, how far off that is at most (95 %), volume and margin, with
     units; empty if not known. A poor estimate has no bounds."""
     rows = []
@@ -47,7 +48,7 @@ def part_rows(report: FitReport, good: bool) -> list[dict[str, str]]:
             (x, y, z), radius = part.center_mm, stated_radius(report.margin, name)
             row |= {"centre": f"({x:.1f}, {y:.1f}, {z:.1f}) mm"}
             row |= {"volume": f"{part.volume_ml:.1f} ml", "margin": radius.words if radius else ""}
-            row |= {"bound": part.bound_words if good else ""}
+            row |= {"bound": assessment.bound_words(name)}
         rows.append(row)
     return rows
 
@@ -56,7 +57,7 @@ def next_evidence(estimate: Estimate | None) -> tuple[NextEvidence, ...]:
     """What to learn next; nothing of an answer that may be another organ, or in another place."""
     if estimate is None or (estimate.finding is not None and estimate.finding.kind not in FAR_OFF):
         return ()
-    return estimate.report.next_evidence
+    return estimate.assessment.next_evidence
 
 
 def next_lines(estimate: Estimate | None) -> list[str]:
@@ -67,6 +68,5 @@ def next_lines(estimate: Estimate | None) -> list[str]:
 
 
 def row_words(row: dict[str, str]) -> str:
-    bound = row["bound"] and f"off by at most {row['bound']} (95 %)"
-    words = (f"centre {row['centre']}", bound, row["volume"], row["margin"])
+    words = (f"centre {row['centre']}", row["bound"], row["volume"], row["margin"])
     return f"{row['part']}: {', '.join(filter(None, words)).replace('centre not', 'not')}"

@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 
 from tumortrack.core import store
+from tumortrack.core.assessment import Assessment, centre_label
 from tumortrack.core.colours import Colour, part_colour, structure_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS
@@ -29,7 +30,6 @@ from tumortrack.core.types import FIRST_TUMOR, ORGAN
 from tumortrack.imaging.case import Case, load_case
 from tumortrack.imaging.segmentation_files import segments, write_dicom_seg, write_seg_nrrd
 from tumortrack.tracking.files import CENTRES, CT, MARGIN, read_report
-from tumortrack.tracking.margins import centre_label
 from tumortrack.tracking.options import ExportOptions
 
 _SCHEMA = (
@@ -145,7 +145,8 @@ class Scene:
     def add_run(self, folder: Path, stored: dict[str, Any]) -> None:
         """The result of `locate`: segmentation, surfaces, margins, tumor centres labelled with
         their uncertainty, and mapped points; camera frame. ``stored``: its report.json."""
-        report, poor = msgspec.convert(stored, FitReport), stored["quality"]["verdict"] != "good"
+        report = msgspec.convert(stored, FitReport)
+        assessment = msgspec.convert(stored["assessment"], Assessment)
         voxels = (folder / "labels.seg.nrrd").read_bytes()
         self._add("Segmentation", "located", {}, ("SegmentationStorage", "labels.seg.nrrd", voxels))
         centres = []
@@ -154,7 +155,8 @@ class Scene:
                 if (file := folder / f"{shown}.ply").exists():
                     self._add_model(shown, part.label, file.read_bytes())
             if part.center_mm is not None and part.label >= FIRST_TUMOR:
-                centres.append((centre_label(report, name, poor), list(part.center_mm)))
+                words = centre_label(name, assessment.bounds, assessment.quality == "poor")
+                centres.append((words, list(part.center_mm)))
         self._add_structures(folder, report.structures)
         self._add_points(CENTRES, centres)
         if (table := folder / "points.csv").exists():

@@ -13,9 +13,10 @@ import numpy as np
 
 import tumortrack
 from tumortrack.core import store
+from tumortrack.core.assessment import Assessment, Quality
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
-from tumortrack.core.estimate import Estimate, Quality
+from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import RAS_FROM_LPS, largest_std_of, std_of
 from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.mesh_query import exact_margin
@@ -89,20 +90,14 @@ def report_head(stamp_ns: int) -> dict[str, Any]:
 
 def report_entry(estimate: Estimate) -> dict[str, Any]:
     """The entries of report.json about an estimate, as JSON types."""
-    finding = estimate.finding
-    quality = {
-        "verdict": estimate.quality,
-        "reason": estimate.reason,
-        "check": "" if finding is None else finding.check,
-        "finding": finding_entry(finding),
-        "advice": estimate.advice,
-    }
+    check = "" if estimate.finding is None else estimate.finding.check
+    quality = {"verdict": estimate.quality, "reason": estimate.reason, "check": check}
     return {
         **report_head(estimate.cloud.stamp_ns),
         **{"seed": estimate.report.seed, "points": estimate.report.points},  # even if they are 0
         **msgspec.to_builtins(estimate.report),
         "quality": quality,
-        "causes": [cause.entry() for cause in estimate.causes],
+        "assessment": msgspec.to_builtins(estimate.assessment, enc_hook=float),
         "organ": organ_entry(estimate.organ),
         "patient": to_builtins(estimate.patient),
     }
@@ -150,11 +145,10 @@ def read_estimate(folder: Path) -> Estimate:
     stored, path = read_report(folder), folder / "occupancy.ply"
     try:
         report = msgspec.convert(stored, FitReport)
-        finding = msgspec.convert(stored["quality"]["finding"], Finding | None)
-        if (finding is None) != (stored["quality"]["verdict"] == "good"):
+        assessment = msgspec.convert(stored["assessment"], Assessment)
+        _ = assessment.reason  # raises if a value is missing
+        if assessment.quality != stored["quality"]["verdict"]:
             raise ArtifactError("its verdict and its finding contradict each other")
-        if finding is not None:
-            _ = finding.words  # raises if a value is missing
         names = [name for name, part in report.parts.items() if part.found]
         table = parse_ply_properties(
             path.read_bytes(), str(path), ("x", "y", "z", "label", "probability")
@@ -166,8 +160,7 @@ def read_estimate(folder: Path) -> Estimate:
             CameraLabels(volume.array, RAS_FROM_LPS @ volume.lps_from_index),
             {name: meshes[name] for name in names},
             report,
-            finding=finding,
-            advice=stored["quality"]["advice"],
+            assessment=assessment,
             patient=patient_in(stored.get("patient"), str(folder)),
             organ=organ_in(stored.get("organ"), str(folder)),
             structures={name: meshes[name] for name in report.structures},

@@ -13,11 +13,14 @@ from typing import Any, Literal
 
 import msgspec
 
+from tumortrack.assessment.verdict import cloud_shares
 from tumortrack.core import store
 from tumortrack.core.config import Config, from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
+from tumortrack.core.estimate import Estimate
 from tumortrack.core.organ import is_tumor
 from tumortrack.core.report import Finding, FitReport, MarginReport, StatedMargin
+from tumortrack.core.types import SensorCloud
 from tumortrack.sense.cloud import FEWEST_POINTS
 from tumortrack.tracking.fingerprint import fingerprint
 
@@ -264,6 +267,19 @@ def stated_margin(report: FitReport, margins: ModelMargins | None, good: bool) -
     return MarginReport(stated=tuple(stated))
 
 
+def with_margin(estimate: Estimate, cloud: SensorCloud, margins: ModelMargins | None) -> Estimate:
+    """The estimate with its model's ``margins`` in its report; poor if it exceeds a limit within
+    which they hold. ``cloud``: in which it was located."""
+    if margins is not None and estimate.finding is None:
+        if estimate.report.unseen is None:
+            estimate = estimate.reporting(unseen=cloud_shares(estimate.organ_mesh, cloud)[1])
+        known = margins_with(estimate.report, margins) or margins  # others: limits of clouds alone
+        finding = exceeded(known.limits, figures(estimate.report, known))
+        estimate = estimate.assessed(finding=finding)
+    margin = stated_margin(estimate.report, margins, estimate.finding is None)
+    return estimate.reporting(margin=margin)
+
+
 class StatedRadius(msgspec.Struct, frozen=True):
     """A radius that holds with this confidence, mm."""
 
@@ -292,13 +308,6 @@ def margin_words(margin: MarginReport | None) -> str:
     highest = margin.stated[-1]
     sizes = ", ".join(f"{name} {mm:.1f} mm" for name, mm in highest.mm.items() if is_tumor(name))
     return f"{100 * highest.confidence:g} % margin: {sizes}"
-
-
-def centre_label(report: FitReport, name: str, poor: bool) -> str:
-    """A tumor's name, with how far off it is at most and its margin as far as they are known."""
-    radius, bound = stated_radius(report.margin, name), report.parts[name].bound_words
-    words = [f"{name} POOR" if poor else name, *([f"95 % within {bound}"] if bound else [])]
-    return ", ".join([*words, radius.words if radius else "no margin stated"])
 
 
 def keep_margins(folder: Path, margins: ModelMargins) -> Path:

@@ -6,11 +6,11 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from tumortrack.assessment.bound import POOR_MM
+from tumortrack.assessment.verdict import explained
 from tumortrack.core.errors import NoEstimate, NotThisOrgan
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import DepthFrame, Look
-from tumortrack.tracking.misses import POOR_MM
-from tumortrack.tracking.quality import explained
 
 _UNDETERMINED = 2.0  # times the radius that makes an answer poor
 _ELSEWHERE = "fit", "strays", "seen_through", "size"  # checks that speak for another piece
@@ -59,8 +59,8 @@ def _doubted(estimate: Estimate) -> bool:
 
 def _sure(estimate: Estimate) -> bool:
     """Whether nothing speaks for another piece, and the tumors' places are determined."""
-    misses_mm = [part.miss_mm or 0.0 for part in estimate.report.tumors.values()]
-    return not _doubted(estimate) and max(misses_mm, default=0.0) < _UNDETERMINED * POOR_MM
+    bounds_mm = [each.error_bound95_mm for each in estimate.assessment.bounds.values()]
+    return not _doubted(estimate) and max(bounds_mm, default=0.0) < _UNDETERMINED * POOR_MM
 
 
 def _likelihood(found: tuple[Estimate, Sequence[Look]]) -> tuple[bool, float]:

@@ -12,6 +12,10 @@ import msgspec
 import numpy as np
 from jaxtyping import Float64
 
+from tumortrack.assessment.advice import TOUCH_MORE, where_to_look
+from tumortrack.assessment.causes import likely_causes, words
+from tumortrack.assessment.disputes import Disputes
+from tumortrack.assessment.verdict import doubt_if_hidden, judged
 from tumortrack.core.config import Config, check_seed
 from tumortrack.core.errors import InputError, NoEstimate, NotThisOrgan
 from tumortrack.core.estimate import Estimate, FollowOptions
@@ -30,13 +34,9 @@ from tumortrack.registration.motion import ElasticMotion, seen_from_first
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import RegionConfig
 from tumortrack.sense.smoothing import clean_cloud
-from tumortrack.tracking.advice import TOUCH_MORE, where_to_look
-from tumortrack.tracking.causes import likely_causes, words
-from tumortrack.tracking.disputes import Disputes
-from tumortrack.tracking.margins import stated_margin
+from tumortrack.tracking.margins import stated_margin, with_margin
 from tumortrack.tracking.model_files import case_model
 from tumortrack.tracking.pieces import likeliest_piece
-from tumortrack.tracking.quality import doubt_if_hidden, judged, with_margin
 
 _DEFAULTS = FollowOptions()
 # For so long after a good estimate the organ is also searched for upside down. In first looks, that
@@ -152,7 +152,7 @@ class Tracker:
         """The estimate with what the model says: its weakness, its margins, whose it is."""
         start = time.perf_counter()
         if self._weakness:
-            estimate = replace(estimate, finding=Finding("model", {"words": self._weakness}))
+            estimate = estimate.assessed(finding=Finding("model", {"words": self._weakness}))
         margins = self.model.margins if len(looks) == 1 else None  # calibrated on single looks
         estimate = with_margin(estimate, looks[0].cloud, margins)
         estimate = replace(estimate, patient=self._patient, organ=self._organ)
@@ -171,7 +171,7 @@ class Tracker:
                 causes = tuple(c for c in causes if c.cause is not Cause.HIDDEN) or _NO_CAUSE
             view = TOUCH_MORE if alone else where_to_look(estimate, looks, hides)
             advice = words(causes, view)
-            estimate = replace(estimate, causes=causes, advice=advice)
+            estimate = estimate.assessed(causes=causes, advice=advice)
         return _timed(estimate, "explain", start)
 
     def _causes(
@@ -386,7 +386,7 @@ class Follower:
         if estimate.report.margin is not None:
             margin = stated_margin(estimate.report, margins, False)
             estimate = estimate.reporting(margin=margin)
-        return replace(estimate, finding=finding)
+        return estimate.assessed(finding=finding)
 
     def _earlier(self, stamp_ns: int, camera_from_last: Affine) -> tuple[Any, ...]:
         """Evidence of before the organ was lost."""

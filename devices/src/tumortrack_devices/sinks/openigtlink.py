@@ -12,15 +12,15 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
+from tumortrack.core.assessment import centre_label
 from tumortrack.core.colours import TO_CUT, name_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, transform_points
 from tumortrack.core.mesh_query import rough_margin
-from tumortrack.core.report import FitReport
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 from tumortrack.tracking.files import CENTRES, CT, MARGIN
-from tumortrack.tracking.margins import centre_label, stated_radius
+from tumortrack.tracking.margins import stated_radius
 from tumortrack_devices.beside import Beside
 from tumortrack_devices.igtl import message as igtl
 from tumortrack_devices.igtl.link import Link
@@ -163,10 +163,9 @@ class OpenIgtLinkSink:
                 yield "TRANSFORM", name, sent, {"TransformStatus": "OK"}
 
     def _centres(self, result: TrackingResult) -> Iterator[_Content]:
-        report = FitReport() if result.estimate is None else result.estimate.report
         tumors = self._context.parts[1:]
         centres = {n: mm for n in tumors if (mm := result.center_mm(n)) is not None}
-        labels = [centre_label(report, name, result.quality != "good") for name in centres]
+        labels = [centre_label(name, result.bounds, result.quality != "good") for name in centres]
         points_mm = transform_points(self._axes, np.reshape([*centres.values()], (-1, 3)))
         if tumors:
             colours = [name_colour(name) for name in centres]

@@ -168,7 +168,8 @@ class StatusPanel:
     def _parts(self, report: FitReport) -> str:
         """A row for each part, with and without an estimate: nothing below must jump. After a
         failed check the bound is not valid, and left out."""
-        margins, good = report.margin, self.state == "good"
+        margins = report.margin
+        bounds = self.result.bounds if self.result and self.state == "good" else {}
         stated = margins.stated[-1].confidence if margins and margins.stated else None
         heads = ["", "volume", "off by at most (95 %)"]
         heads += [f"{100 * stated:g} % margin"] if stated else []
@@ -176,13 +177,13 @@ class StatusPanel:
         for label, name in enumerate(self.parts, start=1):
             part, margin = report.parts.get(name), stated_radius(margins, name)
             volume_ml = part.volume_ml if part else None
-            bound = part.bound_words if part and good else ""
+            bound = bounds.get(name)
             cells = [
                 f"<i style='background:{css(part_colour(label))}'></i>"
                 + escape(name.replace("_", " "))
                 + (" (not found)" if part is not None and not part.found else ""),
                 "–" if volume_ml is None else f"{volume_ml:.1f} ml",
-                bound or "–",
+                "–" if bound is None else f"{bound.error_bound95_mm:.1f} mm",
             ]
             cells += [f"{margin.mm:.1f} mm" if margin else "–"] if stated else []
             rows.append(f"<tr><td>{'</td><td>'.join(cells)}</td></tr>")

@@ -20,6 +20,7 @@ from jaxtyping import Float
 from msgspec.structs import replace
 
 import tumortrack
+from tumortrack.assessment.verdict import cloud_shares
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.report.metrics import outward_miss
@@ -36,7 +37,6 @@ from tumortrack.tracking.margins import (
     measured,
     sized,
 )
-from tumortrack.tracking.quality import cloud_shares
 from tumortrack_lab.margins import conformal
 from tumortrack_lab.margins.table import Miss, Row
 from tumortrack_lab.world.evidence import EvidenceSource

@@ -1,4 +1,4 @@
-"""Learns ``tumortrack.tracking.misses`` from located scenes, and tests it on what is left out."""
+"""Learns ``tumortrack.assessment.bound`` from located scenes, and tests it on what is left out."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import pandas as pd
 from scipy.optimize import nnls
 from scipy.stats import spearmanr
 
+from tumortrack.assessment.bound import POOR_MM, MissModel, figures
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import FAR_MM
 from tumortrack.core.geometry import transform_points
@@ -19,7 +20,6 @@ from tumortrack.registration.model import RegistrationModel
 from tumortrack.report.rivals import best_rigid_pose, rigid_fit
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack.tracking.fingerprint import fingerprint
-from tumortrack.tracking.misses import POOR_MM, MissModel, figures
 from tumortrack.tracking.tracker import Tracker
 
 _CONFIDENCE = 0.95

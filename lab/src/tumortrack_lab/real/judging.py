@@ -112,7 +112,8 @@ def judge(
             std_mm = motion.std_mm(rest.vertices_mm.mean(0, keepdims=True))
             assert std_mm is not None
             tumor["std_mm"] = float(std_mm[0])
-            tumor["radius_mm"] = estimate.report.parts[name].miss_mm
+            bound = estimate.assessment.bounds.get(name)
+            tumor["radius_mm"] = None if bound is None else bound.error_bound95_mm
         row["tumors"].append(tumor)
     return row
 

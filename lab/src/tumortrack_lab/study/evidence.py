@@ -76,7 +76,7 @@ def _advised(estimate: Estimate | None, source: EvidenceSource) -> list[Piece]:
 
 
 def _advised_touches(estimate: Estimate | None) -> list[NextEvidence]:
-    told = () if estimate is None else estimate.report.next_evidence
+    told = () if estimate is None else estimate.assessment.next_evidence
     return [each for each in told if each.kind == "touch"]
 
 

@@ -186,8 +186,8 @@ def _row(tracker: Tracker, scene: Scene, condition: Condition, seed: int) -> dic
         carried = rest.moved(transform_points(pose, rest.vertices_mm))
         rigid_off.append(np.linalg.norm(carried.box_mm.mean(0) - centres[name]))
         off.append(np.linalg.norm(estimate.meshes[name].box_mm.mean(0) - centres[name]))
-        miss_mm = estimate.report.tumors[name].miss_mm
-        beyond |= miss_mm is not None and bool(off[-1] > miss_mm)
+        bound = estimate.assessment.bounds.get(name)
+        beyond |= bound is not None and bool(off[-1] > bound.error_bound95_mm)
     return {
         "quality": estimate.quality, "check": estimate.finding.check if estimate.finding else "",
         "off_mm": float(max(off)), "rigid_mm": float(max(rigid_off)), "beyond": beyond,

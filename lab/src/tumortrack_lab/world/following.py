@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import msgspec
@@ -68,7 +67,7 @@ def track(tracker: Tracker, evidence: Sequence[Evidence] = ()) -> Locate:
         estimate = follower.locate(cloud, frame, evidence=known)
         in_a_row = before + 1 if estimate.quality == "good" else 0
         wait = Finding("model", {"words": "wait"})
-        return replace(estimate, finding=wait) if 0 < in_a_row < SURE_AFTER else estimate
+        return estimate.assessed(finding=wait) if 0 < in_a_row < SURE_AFTER else estimate
 
     return locate
 

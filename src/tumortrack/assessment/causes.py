@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tumortrack.assessment.advice import near_side, unseen
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import Points, rotation_onto
 from tumortrack.core.report import Cause, Check, Likely
@@ -25,10 +26,9 @@ from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.sense.cloud import thin_cloud
 from tumortrack.sense.units import Unit, likely_unit
-from tumortrack.tracking.advice import near_side, unseen
 
 # By cause: what it is called, and what to do about it.
-_WORDS = read_table("tumortrack.tracking", "causes.toml", dict[str, tuple[str, str]])
+_WORDS = read_table("tumortrack.assessment", "causes.toml", dict[str, tuple[str, str]])
 _POINTS = 400  # of a trial fit
 # A trial must cost less than so many times the usual and the present cost; right: 0.1 to 0.5.
 _FITS, _BETTER = 1.0, 0.6

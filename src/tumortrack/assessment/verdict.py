@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 
 import msgspec
 import numpy as np
 from jaxtyping import Bool
 
+from tumortrack.assessment.bound import POOR_MM, bounds_of, depths_within_mm
+from tumortrack.core.assessment import ErrorBound
 from tumortrack.core.errors import NotThisOrgan
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
@@ -17,10 +18,8 @@ from tumortrack.core.types import DepthFrame, Intrinsics, Look, Mesh, SensorClou
 from tumortrack.models.in_distribution import FIT_FACTOR, RIVAL_COST
 from tumortrack.sense.noise import CAMERA_STD
 from tumortrack.sense.render import render_depth
-from tumortrack.tracking.margins import ModelMargins, exceeded, figures, margins_with, stated_margin
-from tumortrack.tracking.misses import POOR_MM, depths_within_mm, with_misses
 
-# Where ``miss_mm`` is not known: largest standard deviation of a tumor's centre, and largest
+# Where no bound is known: largest standard deviation of a tumor's centre, and largest
 # distance to it in another fit that is nearly as likely.
 _MAX_UNCERTAINTY_MM = 3.0
 # Shares of the organ's image that are seen through. Right estimates have up to 0.03 (moving and
@@ -59,9 +58,11 @@ _MAX_UNSEEN = 0.1
 _SEEN_WITHIN_MM = 6.0  # of a point, or twice the points' usual distance
 
 
-def judged(estimate: Estimate, looks: Sequence[Look], strictly: bool = False) -> Estimate:
-    """The estimate with the finding that makes it poor, if any, and in its report the shares of the
-    organ that are seen through, in sight and, of a cloud, not seen.
+def judged(
+    estimate: Estimate, looks: Sequence[Look], strictly: bool = False, factor: float = 1.0
+) -> Estimate:
+    """The estimate with its bounds and the finding that makes it poor, if any, and in its report
+    the shares of the organ that are seen through, in sight and, of a cloud, not seen.
 
     An estimate is poor if it fits the points worse than usual in validation, if the camera sees
     through it, if it lies where a cloud has no points, if it lacks a tumor, or if a tumor's place
@@ -72,6 +73,7 @@ def judged(estimate: Estimate, looks: Sequence[Look], strictly: bool = False) ->
     Args:
         looks: at the organ; of each share, the worst counts.
         strictly: the fit must be no worse than usual, whatever the camera sees round the organ.
+        factor: by which the bounds are multiplied.
     """
     views = _organ_before_cameras(estimate, looks)
     images, clouds = [], []
@@ -90,17 +92,16 @@ def judged(estimate: Estimate, looks: Sequence[Look], strictly: bool = False) ->
     report = msgspec.structs.replace(
         estimate.report, unseen=unseen if clouds else estimate.report.unseen
     )
-    report = with_misses(report)
+    bounds = {name: bound.times(factor) for name, bound in bounds_of(report).items()}
     finding = _misplaced_camera(report.looks)
     finding = finding or _misfit(report, rim_share > _RIM_SHARE and not strictly)
-    finding = finding or _doubt(report)
+    finding = finding or _doubt(report, bounds)
     in_sight = images[0][2] if images else None
     if through > doubtful:
         finding = Finding("seen_through", {"percent": 100 * through})
-    elif unseen > _MAX_UNSEEN and finding is None and not _misses_known(report):
+    elif unseen > _MAX_UNSEEN and finding is None and not _deciding(report, bounds):
         finding = Finding("unseen", {"percent": 100 * unseen})
-    return replace(estimate, finding=finding).reporting(
-        parts=report.parts,
+    return estimate.assessed(bounds=bounds, factor=factor, finding=finding).reporting(
         unseen=report.unseen,
         seen_through=through,
         in_sight=in_sight,
@@ -133,20 +134,7 @@ def doubt_if_hidden(estimate: Estimate, last: Estimate) -> Estimate:
     if in_sight >= _AS_MUCH * doubted_at or moved_mm > _MOVED_MM:
         return estimate
     estimate = estimate.reporting(doubted_in_sight=doubted_at)
-    return replace(estimate, finding=estimate.finding or Finding("hidden_now"))
-
-
-def with_margin(estimate: Estimate, cloud: SensorCloud, margins: ModelMargins | None) -> Estimate:
-    """The estimate with its model's ``margins`` in its report; poor if it exceeds a limit within
-    which they hold. ``cloud``: in which it was located."""
-    if margins is not None and estimate.finding is None:
-        if estimate.report.unseen is None:
-            estimate = estimate.reporting(unseen=cloud_shares(estimate.organ_mesh, cloud)[1])
-        known = margins_with(estimate.report, margins) or margins  # others: limits of clouds alone
-        finding = exceeded(known.limits, figures(estimate.report, known))
-        estimate = replace(estimate, finding=finding)
-    margin = stated_margin(estimate.report, margins, estimate.finding is None)
-    return estimate.reporting(margin=margin)
+    return estimate.assessed(finding=estimate.finding or Finding("hidden_now"))
 
 
 def _misplaced_camera(looks: LooksReport | None) -> Finding | None:
@@ -175,7 +163,7 @@ def _misfit(report: FitReport, surroundings_seen: bool) -> Finding | None:
     return None
 
 
-def _doubt(report: FitReport) -> Finding | None:
+def _doubt(report: FitReport, bounds: Mapping[str, ErrorBound]) -> Finding | None:
     """Another size or pose as likely; a part that is missing, or a tumor that may be far off."""
     size, cost = report.size, report.fit_cost
     if size is not None and size.gain > RIVAL_COST:
@@ -188,19 +176,16 @@ def _doubt(report: FitReport) -> Finding | None:
     for name, part in report.parts.items():
         if not part.found:
             return Finding("missing", {"part": name})
-    if not _misses_known(report):
+    if not (deciding := _deciding(report, bounds)):
         return _unsure(report)
-    misses_mm = {name: part.miss_mm or 0.0 for name, part in report.tumors.items()}
-    name = max(misses_mm, key=misses_mm.__getitem__)
-    miss_mm = misses_mm[name]
-    digits = _telling(miss_mm, POOR_MM)
-    values: dict[str, float | str] = {"part": name, "miss_mm": miss_mm, "limit_mm": POOR_MM}
-    values["digits"] = digits
-    if not miss_mm > POOR_MM:
+    bound_mm, name = max((each.error_bound95_mm, name) for name, each in deciding.items())
+    if not bound_mm > POOR_MM:
         return None
     depth_mm = depths_within_mm(report, name)
-    if 2 * depth_mm**2 > miss_mm**2:  # most of it
+    if 2 * depth_mm**2 > bound_mm**2:  # most of it
         return Finding("depths", {"depth_mm": depth_mm})
+    digits = _telling(bound_mm, POOR_MM)
+    values = {"part": name, "miss_mm": bound_mm, "limit_mm": POOR_MM, "digits": digits}
     return Finding("miss", values)
 
 
@@ -228,9 +213,11 @@ def _telling(value: float, limit: float) -> str:
     return next((n for n in "123" if round(value, int(n)) > limit), "4")
 
 
-def _misses_known(report: FitReport) -> bool:
-    """Whether there are tumors, and it was learned how far off each may be."""
-    return bool(report.tumors) and all(p.miss_mm is not None for p in report.tumors.values())
+def _deciding(report: FitReport, bounds: Mapping[str, ErrorBound]) -> Mapping[str, ErrorBound]:
+    """The bounds by which an answer is judged: all tumors', or of an organ without tumors its own;
+    empty if one is not known."""
+    names = [*report.tumors] or [*report.parts]
+    return {name: bounds[name] for name in names} if bounds.keys() >= set(names) else {}
 
 
 def _unsure(report: FitReport) -> Finding | None:

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from reports import reporting
+from tumortrack.assessment import bound, verdict
+from tumortrack.assessment.bound import POOR_MM, MissModel, bounds_of, figures, shipped
 from tumortrack.core.types import DepthError, Look, SensorCloud
 from tumortrack.models.report import estimate_of
-from tumortrack.tracking import misses, quality
 from tumortrack.tracking.fingerprint import fingerprint
-from tumortrack.tracking.misses import POOR_MM, MissModel, figures, shipped, with_misses
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from warp_objects import ANATOMY, placed
@@ -50,12 +50,14 @@ def test_what_is_shipped_cannot_reward_what_gets_worse(estimate):
 
 
 def test_an_answer_says_how_far_off_its_tumors_may_be(estimate):
-    organ, tumor = (estimate.report.parts[name] for name in ("kidney", "tumor_1"))
-    assert organ.miss_mm is None
+    bounds, tumor = estimate.assessment.bounds, estimate.report.parts["tumor_1"]
+    assert [*bounds] == ["tumor_1"]
+    assert bounds["tumor_1"].least_sure == tumor.center_axes[0]
     known = figures(estimate.report, "tumor_1")
     depth_mm = 1.96 * estimate.report.motion.depth_share * math.hypot(*tumor.center_mm)
     assert depth_mm > 1
-    assert tumor.miss_mm == pytest.approx(math.hypot(shipped().radius_mm(known), depth_mm))
+    bound_mm = math.hypot(shipped().radius_mm(known), depth_mm)
+    assert bounds["tumor_1"].error_bound95_mm == pytest.approx(bound_mm)
     nearest_mm = np.linalg.norm(visible().points_mm - tumor.center_mm, axis=1).min()
     assert tumor.nearest_mm == pytest.approx(nearest_mm, abs=1.0)  # of the points that are fitted
     assert known["nearest"] == pytest.approx(math.log(tumor.nearest_mm))
@@ -67,17 +69,17 @@ def test_a_miss_that_may_be_large_makes_an_answer_poor(slim_model, monkeypatch):
     for radius_mm, depth_mm, kind in cases:
         cloud = replace(visible(), depth_error=DepthError(depth_mm))
         model = MissModel(fingerprint(), math.log(radius_mm), {}, {})
-        monkeypatch.setattr(misses, "shipped", lambda model=model: model)
+        monkeypatch.setattr(bound, "shipped", lambda model=model: model)
         found = tracker.locate(cloud, 16, 0).finding
         assert (None if found is None else found.kind) == kind
 
 
 def test_a_method_that_does_not_know_enough_has_none_and_keeps_the_older_checks(estimate):
     surfaces = estimate_of(estimate.meshes)
-    assert with_misses(surfaces.report).parts["tumor_1"].miss_mm is None
-    std_mm = quality._MAX_UNCERTAINTY_MM + 0.1
+    assert bounds_of(surfaces.report) == {}
+    std_mm = verdict._MAX_UNCERTAINTY_MM + 0.1
     unsure = reporting(surfaces, parts={"tumor_1": {"center_std_mm": std_mm}})
-    assert quality._doubt(unsure.report).kind == "unsure"
+    assert verdict._doubt(unsure.report, {}).kind == "unsure"
 
 
 def test_of_several_cameras_the_worst_counts_and_one_that_nobody_stated(slim_model):

@@ -11,6 +11,8 @@ import pytest
 from elastic_objects import UP
 from reports import looked, reporting
 from stories import answered, refusal, succeeded, tumortrack
+from tumortrack.assessment import bound
+from tumortrack.assessment.verdict import cloud_shares, doubt_if_hidden, judged, seen_through
 from tumortrack.core import store
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.types import DepthFrame, Mesh, PointNoise, SensorCloud
@@ -19,10 +21,8 @@ from tumortrack.registration.motion import ElasticMotion
 from tumortrack.sense.camera import d405
 from tumortrack.sense.render import render_depth
 from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
-from tumortrack.tracking import misses
 from tumortrack.tracking.files import report_entry
 from tumortrack.tracking.model_files import load_model
-from tumortrack.tracking.quality import cloud_shares, doubt_if_hidden, judged, seen_through
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from warp_objects import ANATOMY, PLACE_MM, TURNED, slim_clinic
 
@@ -33,7 +33,7 @@ EXACT = {"times": 1.0, "gain": 0.0}
 @pytest.fixture(autouse=True)
 def misses_unknown(monkeypatch):
     """An ellipsoid may slip far along itself; that is not what is tested here."""
-    monkeypatch.setattr(misses, "figures", lambda *_: None)
+    monkeypatch.setattr(bound, "figures", lambda *_: None)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def doubted(estimate, seen, **report):
     found = judged(reporting(estimate, **sure), looked(seen))
     said = report_entry(found)["quality"]
     assert (said["verdict"], said["reason"]) == (found.quality, found.reason)
-    assert bool(said["check"]) == (found.quality == "poor") == (said["finding"] is not None)
+    assert bool(said["check"]) == (found.quality == "poor")
     return found
 
 
@@ -130,7 +130,7 @@ def test_what_fits_worse_all_of_a_sudden_is_poor(tracker, stages):
     assert cost.now > cost.usual
     worse = "worse than in most"
     assert worse not in first.reason  # the ellipsoid's half turn is another matter
-    first, clean = (replace(one, finding=None) for one in (first, clean))
+    first, clean = (one.assessed(finding=None) for one in (first, clean))
     assert worse not in tracker.follow(spoiled, first, seen=table).reason
     sudden = tracker.follow(spoiled, clean, seen=table)
     assert worse in sudden.reason

@@ -16,9 +16,13 @@ from tumortrack.tracking.files import write_estimate
 VOLUME = CameraLabels(np.ones((4, 4, 4), np.uint8), np.eye(4))
 
 
+def stored(finding):
+    return replace(small_estimate(), volume=VOLUME).assessed(finding=finding)
+
+
 @pytest.mark.parametrize("finding", [None, poor("the organ hides")])
 def test_what_was_written_is_read(tmp_path, finding):
-    write_estimate(tmp_path / "run", replace(small_estimate(), volume=VOLUME, finding=finding))
+    write_estimate(tmp_path / "run", stored(finding))
     back = tt.load_estimate(tmp_path / "run")
     assert (back.finding, back.quality) == (finding, "good" if finding is None else "poor")
 
@@ -36,9 +40,10 @@ def test_what_was_written_is_read(tmp_path, finding):
 )
 def test_a_verdict_that_does_not_follow_from_its_finding_is_refused(tmp_path, finding, change):
     run = tmp_path / "run"
-    write_estimate(run, replace(small_estimate(), volume=VOLUME, finding=finding))
+    write_estimate(run, stored(finding))
     report = json.loads((run / "report.json").read_text())
-    report["quality"] |= change
+    for section in report.keys() & {"quality", "assessment"}:
+        report[section] |= {k: v for k, v in change.items() if k in report[section]}
     store.write_json(run / "report.json", report)
     store.seal(run, "run", {}, "camera")
     with pytest.raises(tt.errors.ArtifactError, match="is no whole run"):

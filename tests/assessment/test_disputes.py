@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -36,7 +35,7 @@ class Scripted(Tracker):
         self.frames = iter(frames)
 
     def follow(self, cloud, *_):
-        estimate = replace(small_estimate(cloud.stamp_ns), finding=None)
+        estimate = small_estimate(cloud.stamp_ns).assessed(finding=None)
         return estimate.reporting(evidence=tuple(next(self.frames)))
 
 

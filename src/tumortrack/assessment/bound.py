@@ -14,8 +14,7 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-import msgspec
-
+from tumortrack.core.assessment import ErrorBound
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.report import FitReport
 
@@ -45,7 +44,7 @@ class MissModel(Config, frozen=True):
 @cache
 def shipped() -> MissModel:
     """What comes with this version."""
-    text = files("tumortrack.tracking").joinpath(_NAME).read_text()
+    text = files("tumortrack.assessment").joinpath(_NAME).read_text()
     return from_builtins(json.loads(text), MissModel, _NAME)
 
 
@@ -80,12 +79,12 @@ def depths_within_mm(report: FitReport, name: str) -> float:
     return _WITHIN * report.motion.depth_share * math.hypot(*center_mm)
 
 
-def with_misses(report: FitReport) -> FitReport:
-    """The report with ``miss_mm`` of its tumors, where the method knows enough: what was learned,
-    and what the camera's depths err by beside that."""
-    parts = dict(report.parts)
+def bounds_of(report: FitReport) -> dict[str, ErrorBound]:
+    """Of each tumor, where the method knows enough: what was learned, and what the camera's depths
+    err by beside that."""
+    bounds = {}
     for name, part in report.tumors.items():
         if (known := figures(report, name)) is not None:
-            miss_mm = math.hypot(shipped().radius_mm(known), depths_within_mm(report, name))
-            parts[name] = msgspec.structs.replace(part, miss_mm=miss_mm)
-    return msgspec.structs.replace(report, parts=parts)
+            bound_mm = math.hypot(shipped().radius_mm(known), depths_within_mm(report, name))
+            bounds[name] = ErrorBound(bound_mm, part.center_axes and part.center_axes[0])
+    return bounds

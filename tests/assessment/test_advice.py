@@ -10,13 +10,13 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from reports import looked, report_of
+from tumortrack.assessment.advice import advise, where_to_look
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import Look, Mesh, OccupancyCloud, SensorCloud
 from tumortrack.registration.advice import Advisor
 from tumortrack.registration.motion import ElasticMotion
-from tumortrack.tracking.advice import advise, where_to_look
 from warp_objects import ANATOMY, shape
 
 CENTRE = np.array([20.0, -10.0, 180.0])

@@ -1,0 +1,76 @@
+"""What is made of an answer, once: how far off its parts may be, whether it is good, and what to do
+about it if it is not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import msgspec
+
+from tumortrack.core.report import Finding, Likely, NextEvidence, Point
+
+Quality = Literal["good", "poor", "none"]  # none: there is no estimate
+NOT_JUDGED = Finding("not_judged")
+
+
+class ErrorBound(msgspec.Struct, frozen=True):
+    """With 95 % no point of this part, as drawn in the CT, lies farther than ``error_bound95_mm``
+    from where it is shown; ``least_sure``: the direction that is least sure (unit vector, camera
+    frame), if the method knows one."""
+
+    error_bound95_mm: float
+    least_sure: Point | None = None
+
+    def times(self, factor: float) -> ErrorBound:
+        return msgspec.structs.replace(self, error_bound95_mm=factor * self.error_bound95_mm)
+
+    @property
+    def words(self) -> str:
+        return f"off by at most {self.error_bound95_mm:.1f} mm (95 %)"
+
+
+class Assessment(msgspec.Struct, frozen=True, kw_only=True):
+    """What an answer's figures amount to.
+
+    Attributes:
+        bounds: by part; absent: not known.
+        factor: by which they were multiplied, as found on scenes of known truth (``tumortrack
+            margins``).
+        finding: why it is poor (see ``assessment.verdict.judged``); None: it is good.
+        causes: of a poor one, the likeliest first: see ``assessment.causes``.
+        advice: sentences after the finding's: what probably happened and what to do.
+        next_evidence: what to learn next, the best first.
+    """
+
+    bounds: Mapping[str, ErrorBound] = {}
+    factor: float = 1.0
+    finding: Finding | None = NOT_JUDGED
+    causes: tuple[Likely, ...] = ()
+    advice: str = ""
+    next_evidence: tuple[NextEvidence, ...] = ()
+
+    @property
+    def quality(self) -> Quality:
+        return "good" if self.finding is None else "poor"
+
+    @property
+    def reason(self) -> str:
+        """Why it is poor and what to do; empty: it is good."""
+        return "" if self.finding is None else self.finding.words + self.advice
+
+    @property
+    def shown(self) -> Mapping[str, ErrorBound]:
+        """The bounds to be shown: a poor answer has none."""
+        return self.bounds if self.finding is None else {}
+
+    def bound_words(self, part: str) -> str:
+        """How far off a part is at most; empty: not known, or the answer is poor."""
+        return self.shown[part].words if part in self.shown else ""
+
+
+def centre_label(name: str, bounds: Mapping[str, ErrorBound], poor: bool) -> str:
+    """A tumor's name, and how far off it is at most as far as that is known."""
+    if poor:
+        return f"{name} POOR"
+    return f"{name}, {bounds[name].words}" if name in bounds else name
