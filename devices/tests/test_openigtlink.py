@@ -20,7 +20,7 @@ from igtl_objects import (
 )
 from live_objects import STAMP_NS, empty_update, small_anatomy, small_setting, small_update
 from motions import Wave
-from reports import NOWHERE, reporting
+from reports import NOWHERE, bounded, reporting
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
 from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
