@@ -1,4 +1,4 @@
-"""`margins`: the factor of known ratios, states and their table, and the command as users meet it."""
+"""`margins`: the factor of known ratios, states and their table, and the command as used."""
 
 from __future__ import annotations
 
