@@ -24,6 +24,7 @@ from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.evidence import Held, Landmark, Outline, Touch
 from tumortrack.core.geometry import plane_section
+from tumortrack.core.report import FitReport
 from tumortrack.core.types import SensorCloud
 from tumortrack.imaging.case import Case, save_case
 from tumortrack.imaging.surface import surfaces

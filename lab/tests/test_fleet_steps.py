@@ -160,13 +160,14 @@ def test_evaluation_has_states_of_its_own_and_more_views_of_them(fleets):
         assert {"rigid_fit_middle_mm", "rigid_fit_outside_mm"} < set(row["tumors"][0])
 
 
-def test_few_states_state_no_margin_but_what_they_can(fleets):
+def test_few_states_give_no_factor_but_what_they_can(fleets):
     _, [one], held, _ = fleets[0]
     result = json.loads((held.get(chain(one)["margins"].key) / "result.json").read_text())
     assert result["reason"].startswith("too few states")
-    assert result["margin_mm"] == {}
+    assert result["bound_factor"] is None
     answers = result["answers"]
     assert result["holds_for"] == answers / (answers + 1)
+    assert (result["largest_ratio"] is not None) == (answers > 0)
 
 
 def test_tables_say_who_failed_and_who_needs_an_eye(fleets):

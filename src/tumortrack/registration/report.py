@@ -87,8 +87,8 @@ def part_deviations(
     squares, axes = np.linalg.eigh(center_mm2)
     return {
         "center_std_mm": float(np.sqrt(squares.mean())),
-        "center_axes_std_mm": np.sqrt(squares[::-1]).tolist(),
-        "center_axes": axes.T[::-1].tolist(),
+        "center_axes_std_mm": tuple(np.sqrt(squares[::-1]).tolist()),
+        "center_axes": tuple(map(tuple, axes.T[::-1].tolist())),
         "surface_std_mm": float(np.sqrt(np.linalg.eigvalsh(surface_mm2).max())),
         "nearest_mm": float(np.sqrt(((points_mm - center_mm) ** 2).sum(1).min())),
     }
