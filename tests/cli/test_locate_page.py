@@ -117,10 +117,10 @@ def test_without_an_estimate_there_is_a_page_that_says_why(raw, clinic_model):
     assert "none: no piece of the scene lies within" in line
     assert "--box" in line
     assert "NONE: no estimate" in (raw / "run" / PAGE).read_text()
-    quality = json.loads((raw / "run" / "report.json").read_text())["quality"]
-    assert quality["reason"] in line
-    assert quality["finding"]["kind"] == "pick_missed"
-    assert quality["finding"]["values"]["reach_mm"] > 0
+    report = json.loads((raw / "run" / "report.json").read_text())
+    assert report["quality"]["reason"] in line
+    assert report["assessment"]["finding"]["kind"] == "pick_missed"
+    assert report["assessment"]["finding"]["values"]["reach_mm"] > 0
     assert {path.name for path in (raw / "run").iterdir()} == {
         *(PAGE, PICTURE, "manifest.json", "report.json")
     }
