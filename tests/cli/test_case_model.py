@@ -72,7 +72,7 @@ def test_the_first_command_makes_it_and_all_others_take_it(case, cloud, tmp_path
         assert "on simulated scenes points inside are " in said
         assert "the organ lies turned about" in said or "it lies turned about" in said
         assert "tilted by up to 30 degrees" in said
-        assert "not calibrated" in said
+        assert "multiplied by" not in said
         assert "train" not in said
         assert "step" not in said
     assert LAYS in of_model
