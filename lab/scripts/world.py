@@ -1,4 +1,4 @@
-"""Scenes of a wider world, to calibrate and test margins on, and a model's estimates in them.
+"""Scenes of a wider world, to calibrate and test bounds on, and a model's estimates in them.
 
     make world ARGS='CASE OUT --count 320 --model MODEL'     (about 4 s a scene)
 

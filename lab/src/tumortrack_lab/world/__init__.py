@@ -1,4 +1,4 @@
-"""A wider world: scenes to calibrate and test margins on, with other physics, other noise and other
+"""A wider world: scenes to calibrate and test bounds on, with other physics, other noise and other
 views than the default method's own simulation, with which they share no code.
 
 ``families``: eight families of states (rest, plate, clamp, twist, pull, tether, roll, cut), each
