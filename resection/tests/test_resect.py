@@ -81,7 +81,9 @@ def write_run(folder, motion=None, tumors=(TUMOR,)):
         }
         for name, mesh in camera.items()
     }
-    estimate = Estimate(cloud, volume, camera, report_of(parts=parts), motion, finding=None)
+    estimate = Estimate(cloud, volume, camera, report_of(parts=parts), motion).assessed(
+        finding=None
+    )
     estimate = replace(estimate, patient=Patient(**WHOSE))
     write_estimate(folder, estimate, about={"model": {"case_sha256": CASE}})
     return organ
