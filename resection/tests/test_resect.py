@@ -632,8 +632,6 @@ def test_a_film_is_an_animation(story, tmp_path):
         (["--frame", "FRAME"], "must have camera_from_robot"),
         (["--cell", "LOOSE"], "tool_error_mm is -1; allowed: over 0 to 50"),
         (["--moved", 0], "moved_mm is 0; allowed: over 0 to 100"),
-        (["--confidence", 0.95], "--confidence"),
-        (["--sigmas", 2], "--sigmas"),
         (["--config", "SIGMAS"], "unknown field `sigmas`"),
     ],
 )
