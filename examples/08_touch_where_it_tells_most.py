@@ -44,12 +44,11 @@ def tell(known: str, estimate: tt.Estimate, targets: Any) -> None:
     """``targets``: points inside the parts, in the CT and where they truly are (mm)."""
     print(f"{known}: {estimate.quality}")
     assert estimate.motion is not None
-    for label, name in enumerate(estimate.report.parts, start=1):
-        mine = targets.labels == label
+    for name, bound in estimate.assessment.bounds.items():
+        mine = targets.labels == estimate.report.parts[name].label
         now_mm = estimate.motion.carry(targets.points_ct[mine])
         off_mm = np.linalg.norm(now_mm.mean(0) - targets.points_mm[mine].mean(0))
-        std_mm = estimate.report.parts[name].center_std_mm
-        print(f"  {name}: centre off by {off_mm:.1f} mm, standard deviation {std_mm:.1f} mm")
+        print(f"  {name}: its centre is {off_mm:.1f} mm off; stated: {bound.words}")
 
 
 if __name__ == "__main__":

@@ -34,7 +34,6 @@ from tumortrack.simulate.dataset import scene_maker
 from tumortrack.simulate.deform.elastic import ElasticConfig
 from tumortrack.simulate.scene import SceneConfig
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack.tracking.margins import measured
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 
 Numbers = dict[str, Any]
@@ -59,6 +58,20 @@ def tracker() -> Tracker:
 def maker(kind: str) -> Callable[[int], Scene]:
     elastic = SceneConfig(deform=(ElasticConfig(),))
     return scene_maker(phantom(), SceneConfig() if kind == "dragged" else elastic, SEED)
+
+
+def measured(report: FitReport) -> dict[str, float]:
+    """What an answer says of its fit; larger is worse."""
+    deviations = [part.surface_std_mm for part in report.tumors.values()]
+    known, cost = [std_mm for std_mm in deviations if std_mm is not None], report.fit_cost
+    values = {
+        "fit_cost": None if cost is None else cost.now / cost.usual,
+        "rarity": None if report.motion is None else report.motion.rarity,
+        "unseen": report.unseen,
+        "seen_through": report.seen_through,
+        "unsure_mm": max(known, default=None),
+    }
+    return {name: float(value) for name, value in values.items() if value is not None}
 
 
 def record(locate: Callable[[], Estimate], points_mm: np.ndarray) -> Numbers:

@@ -39,7 +39,7 @@ ROOT = Path(__file__).parents[1]
 LATEST = ROOT / "runs/replay.json"
 KEPT = ROOT / "src/tumortrack/tracking/answers.json"
 SAME_MM = 0.05  # far above what processors differ by, far below what anybody measures
-SAME_SHARE = 0.02  # of a figure that margins have a limit for
+SAME_SHARE = 0.02  # of a figure of an answer's fit
 SAME_INPUT_MM = 0.01
 SHORT = (3, 4, 2, 1)  # 15 clouds, 4 images, 8 with evidence, 3 frames
 

@@ -31,7 +31,7 @@ from tumortrack_lab.fleet.results import LOOK, PATIENTS, PICTURES, SCENES
 from tumortrack_lab.real.kidneys import SET_ASIDE, WHERE
 from tumortrack_lab.study import scripts
 from tumortrack_lab.study.document import ReportWriter, beside_rigid, share_words, spread_mm
-from tumortrack_lab.study.trust import BANDS, band_of
+from tumortrack_lab.world.estimates import BANDS, band_of
 
 DEVELOPMENT = (0, 2, 3)
 _WORST = 4  # pictures

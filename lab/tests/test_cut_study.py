@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from reports import bounded
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import rigid, transform_points
-from tumortrack.core.report import MarginReport, StatedMargin
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.simulate.scene_folder import Scene
@@ -158,11 +158,9 @@ def test_the_margin_grows_by_what_the_estimate_is_unsure_of(case):
 def test_a_stated_margin_pays_for_an_estimate_that_is_as_far_off(case):
     """3 mm of it, with 2 mm of hand-eye, 3 of tool and 2 of motion as nobody states them."""
     off, radius_mm = shifted(shift_mm=3.0, std_mm=0.5), 3.0
-    stated = MarginReport(stated=(StatedMargin(confidence=0.95, mm={"tumor_1": radius_mm}),))
 
     def locate(scene, grid):
-        estimate = off.locate(scene, grid)
-        return estimate.assessed(finding=None).reporting(margin=stated)
+        return bounded(off.locate(scene, grid), tumor_1=radius_mm)
 
     rows = cut_one(case, replace(off, locate=locate), "D0", "noise", 64)
     assert all(row["good"] for row in rows)

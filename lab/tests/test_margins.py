@@ -1,120 +1,183 @@
-"""`margins` as a user meets it: calibrate, state, plan; what is refused."""
+"""`margins`: the factor of known ratios, states and their table, and the command as used."""
 
 from __future__ import annotations
 
 import json
 import shutil
-from pathlib import Path
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from stories import answered, refusal, succeeded, tumortrack
 from tumortrack.core import store
-from tumortrack.core.evidence import evidence_json
-from tumortrack.core.mesh_files import read_mesh
-from tumortrack.report.metrics import outward_miss
+from tumortrack.core.errors import InputError
 from tumortrack.simulate.scene_folder import list_scenes, read_scene
-from tumortrack.tracking.margins import read_margins
-from tumortrack_lab.world.evidence import EXACT, EvidenceSource
+from tumortrack.tracking.bound_factor import NAME, read_factor
+from tumortrack.tracking.model_files import load_model
+from tumortrack.tracking.tracker import Tracker
+from tumortrack_lab.margins import factor
+from tumortrack_lab.margins.factor import LEAST, Locating, factor_of, list_states
+from tumortrack_lab.margins.table import Row, head_of, open_table
+from tumortrack_lab.world.scenes import simplified
 
-COUNT = 56  # 7 tested states without a gross miss show 50 %; two fifths of good ones are tested
+FIRST, SECOND = Row("a", "1", ratio=0.5), Row("b", "2", doubt="poor")
+COUNT = 12
+
+
+@pytest.mark.parametrize(("count", "rank"), [(59, 57), (99, 95), (119, 114), (200, 191)])
+def test_the_factor_is_the_known_order_statistic(count, rank):
+    ratios = np.random.default_rng(0).permutation(np.arange(1, count + 1)) / 10
+    rows = [Row(str(n), "", ratio=float(ratio)) for n, ratio in enumerate(ratios)]
+    rows += [Row("poor", "", doubt="poor")] * 7
+    assert factor_of(rows) == (rank / 10, count)
+
+
+def test_a_factor_holds_for_as_many_as_it_says():
+    rng, held = np.random.default_rng(1), []
+    for _ in range(400):
+        ratios = rng.exponential(size=LEAST + 100)
+        found, _ = factor_of([Row("", "", ratio=float(ratio)) for ratio in ratios[:LEAST]])
+        held.append((ratios[LEAST:] <= found).mean())
+    assert np.mean(held) == pytest.approx(57 / 60, abs=0.006)  # four standard errors
+
+
+def test_too_few_answers_are_refused_with_their_number():
+    rows = [Row("", "", ratio=1.0)] * (LEAST - 1) + [Row("", "", doubt="poor")] * 100
+    with pytest.raises(InputError, match="58 scenes, a state each, have a good answer; 59 are"):
+        factor_of(rows)
+
+
+def test_a_table_goes_on_where_it_was_killed(tmp_path):
+    path, head = tmp_path / "table.jsonl", head_of("abc", 0)
+    with open_table(path, head) as (rows, add):
+        assert rows == []
+        add(FIRST)
+        with pytest.raises(InputError, match="filled by another process"), open_table(path, head):
+            pass
+    whole = path.read_bytes()
+    path.write_bytes(whole + b'{"scene": "un')  # killed while it wrote
+    with open_table(path, head) as (rows, add):
+        assert rows == [FIRST]
+        add(SECOND)
+    with open_table(path, head) as (rows, _):
+        assert rows == [FIRST, SECOND]
+    with (
+        pytest.raises(InputError, match="begun with another model_sha256 and seed"),
+        open_table(path, head_of("other", 1)),
+    ):
+        pass
+    path.write_bytes(whole[:10])  # the first line was cut short
+    with open_table(path, head) as (rows, _):
+        assert rows == []
+
+
+def test_a_table_is_not_made_of_somebodys_notes(tmp_path):
+    for text in ("first line\nno end of line", "[1]\n{}\n"):
+        (tmp_path / "notes.txt").write_text(text)
+        with (
+            pytest.raises(InputError, match="not a table"),
+            open_table(tmp_path / "notes.txt", head_of("sha", 0)),
+        ):
+            pass
+        assert (tmp_path / "notes.txt").read_text() == text
+
+
+def test_one_scene_of_each_state_counts(tmp_path):
+    for n in range(6):
+        (tmp_path / f"{n}").mkdir()
+        (tmp_path / f"{n}" / "cloud.ply").touch()
+        store.write_json(tmp_path / f"{n}" / "meta.json", {"family": "bed", "state": f"s{n // 2}"})
+    assert sorted(int(one.name) // 2 for one in list_states([tmp_path], 0)) == [0, 1, 2]
+    picks = {tuple(one.name for one in list_states([tmp_path], seed)) for seed in range(20)}
+    assert len(picks) > 4  # of 8
+    store.write_json(tmp_path / "0" / "meta.json", {"state": "other", "model_organ": False})
+    assert len(list_states([tmp_path], 0)) == 3
 
 
 @pytest.fixture(scope="module")
 def scenes(once, phantom_case):
-    """Scenes, a state each, with targets."""
-
     def make(folder):
         succeeded(tumortrack("simulate", phantom_case, folder, "--scenes", COUNT, "--elastic"))
-        for scene in list_scenes(folder):
-            meta = {**store.read_json(scene / "meta.json"), "family": "bed", "visible_share": 0.9}
-            store.write_json(scene / "meta.json", meta)
 
     return once("margin_scenes", make)
 
 
-def test_margins_are_found_stated_and_planned_with(ready_case, scenes, tmp_path):
-    """Of a case: they are kept beside its model."""
+def good_row(locating, scenes):
+    rows = ((path, locating.row(read_scene(path), path)) for path in list_scenes(scenes))
+    return next((path, row) for path, row in rows if row.ratio is not None)
+
+
+def test_a_ratio_is_the_farthest_vertex_over_its_bound(ready_case, scenes):
+    model = load_model(ready_case, "cpu")
+    tracker = Tracker(replace(model, bound_factor=4.0))  # not counted: it would be found anew
+    path, row = good_row(Locating(tracker, 0), scenes)
+    scene = read_scene(path)
+    found = Tracker(model).locate(scene.cloud, 8, 0, scene.depth)
+    ratios = []
+    for rest, true, name in zip(
+        tracker.anatomy_ct.tumors, scene.reference.tumors, model.parts[1:], strict=True
+    ):
+        moved, triangles = found.motion.carry(rest.vertices_mm), rest.faces.ravel()
+        off_mm = np.linalg.norm(moved[triangles] - true.vertices_mm[true.faces.ravel()], axis=1)
+        ratios.append(off_mm.max() / found.assessment.bounds[name].error_bound95_mm)
+    assert row.ratio == pytest.approx(max(ratios), rel=1e-4)
+    # A scene of the wider world has the triangles of the simplified case.
+    few = simplified(tracker.anatomy_ct)
+    wide = scene.reference.of(p.moved(found.motion.carry(p.vertices_mm)) for p in few.parts)
+    exact = Locating(tracker, 0).row(replace(scene, reference=wide), path)
+    assert exact.ratio == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_factor_is_found_kept_and_applied(ready_case, scenes, tmp_path, monkeypatch):
+    """Of a case: it is kept beside its model."""
     case, model = tmp_path / "case", tmp_path / "case" / "model"
     shutil.copytree(ready_case, case)
-    table = model / "margins.jsonl"
-    cloud, run = list_scenes(scenes)[3] / "cloud.ply", tmp_path / "run"
-    said = answered(tumortrack("locate", case, cloud, tmp_path / "before", "--device", "cpu"))
-    assert "no margin: the model was not calibrated" in said
+    table, calibrate = model / "margins.jsonl", ("margins", case, scenes, "--device", "cpu")
     assert "give folders of scenes" in refusal(tumortrack("margins", case))
-    calibrate = ("margins", case, scenes, "--device", "cpu", "--confidence")
-    assert "from 0.5 to 0.99" in refusal(tumortrack(*calibrate, 95))
-    said = refusal(tumortrack(*calibrate, 0.95))
-    assert f"{COUNT} scenes given, a state each; about 180 are needed" in said
+    assert f"{COUNT} scenes given, a state each; 59 good" in refusal(tumortrack(*calibrate))
     assert not table.exists()  # nothing was located in vain
-    succeeded(tumortrack(*calibrate, 0.5))
+    monkeypatch.setattr(factor, "LEAST", 2)
+    monkeypatch.setattr(factor, "_CONFIDENCE", 0.5)
+    from tumortrack_lab.cli.margins import Margins
+
+    command = Margins(model=case, scenes=(scenes,), device="cpu")
+    command.run()
     located = table.read_bytes()
     assert located.count(b"\n") == 1 + COUNT
-    assert "touches6 is not allowed" in refusal(
-        tumortrack(*calibrate, 0.5, "--evidence", "touches6")
-    )
-    said = succeeded(tumortrack(*calibrate, 0.5, 0.6, "--evidence", "touch6"))
+    command.run()
     assert table.read_bytes() == located  # located once
-    assert "60 % margin of a tumor's surface: " in said
-    assert "50 % margin of mapped points: " in said
-    assert "bed, over 2/3, " in said
-    assert "with touch6 or more beside the cloud:" in said
-    assert (model / "margins-touch6.jsonl").read_bytes().count(b"\n") == 1 + COUNT
-
     rows = [json.loads(line) for line in located.splitlines()[1:]]
-    clouds = [Path(row["scene"]) / "cloud.ply" for row in rows if not row["doubt"]]
-    for good in clouds:
-        said = answered(tumortrack("locate", case, good, run, "--overwrite"))
-        if store.read_json(run / "report.json")["margin"]["stated"]:
-            break
-    radii = store.read_json(run / "report.json")["margin"]["stated"]
-    assert [one["confidence"] for one in radii] == [0.5, 0.6]
-    radius = radii[1]["mm"]["tumor_1"]
-    assert radii[0]["mm"]["tumor_1"] <= radius
-    assert f"60 % margin {radius:.1f} mm" in said
-    shell, tumor = (read_mesh(run / f"{name}.ply") for name in ("tumor_1_margin", "tumor_1"))
-    assert outward_miss(tumor, shell) == pytest.approx(radius, abs=0.2)
+    ratios = sorted(row["ratio"] for row in rows if row["ratio"] is not None)
+    found = read_factor(model)
+    assert (found.factor, found.answers) == (ratios[len(ratios) // 2], len(ratios))
+    assert load_model(case, "cpu").bound_factor == found.factor
+    assert found.words in succeeded(tumortrack("inspect", case))
 
-    file = tmp_path / "evidence.json"
-    for good in clouds:  # the first that is as good with seven touches
-        source = EvidenceSource.of(read_scene(good.parent), [0], EXACT)
-        pieces = [piece.evidence for piece in source.touches_at_random(7, None)]
-        file.write_bytes(evidence_json(tuple(pieces)))
-        touched = ("--evidence", file, "--device", "cpu", "--overwrite")
-        answered(tumortrack("locate", case, good, tmp_path / "touched", *touched))
-        report = store.read_json(tmp_path / "touched" / "report.json")
-        if report["margin"]["stated"]:
-            break
-    group = read_margins(model).others[0]
-    deviation = report["parts"]["tumor_1"]["surface_std_mm"]
-    figures = {"rarity": report["motion"]["rarity"]}
-    at = group.shells[1].radii["tumor"].at(deviation, figures)
-    assert report["margin"]["stated"][1]["mm"]["tumor_1"] == pytest.approx(at)
-
-    plan = ("plan", run, tmp_path / "plan", "--no-arms", "--confidence")
-    assert "states no 95 % margin of tumor_2" in refusal(tumortrack(*plan, 0.95))
-    beside = ("--margin", 1, "--keep-away", "tumor_1=0.5", "--accept-budget")  # there is no room
-    said = succeeded(tumortrack(*plan, 0.6, *beside))
-    budgets = store.read_json(tmp_path / "plan" / "plan.json")["budgets"]
-    stated = {budget["part"]: budget for budget in budgets}
-    radius = radii[1]["mm"]["tumor_2"]
-    assert list(stated) == ["tumor_2", "tumor_1"]
-    for part, budget in stated.items():
-        assert budget["tracking_mm"] == radii[1]["mm"][part]
-        assert budget["confidence"] == 0.6
-    assert f"tracking {radius:5.1f}  60 % margin" in said
-    assert f"within {radius:.1f} mm of its estimate in 60 of 100 such cases" in said
+    run, bounds = tmp_path / "run", {}
+    for name, given in (("with", case), ("without", ready_case)):
+        cloud = list_scenes(scenes)[0] / "cloud.ply"
+        answered(tumortrack("locate", given, cloud, run / name, "--device", "cpu"))
+        bounds[name] = store.read_json(run / name / "report.json")["assessment"]
+    assert bounds["with"]["factor"] == found.factor
+    assert bounds["without"]["factor"] == 1.0
+    assert found.factor * bounds["without"]["bounds"]["tumor_1"][
+        "error_bound95_mm"
+    ] == pytest.approx(bounds["with"]["bounds"]["tumor_1"]["error_bound95_mm"])
 
     meta = list_scenes(scenes)[0] / "meta.json"
     written = meta.read_bytes()
     try:
         meta.write_bytes(written + b" ")
-        assert "was changed since it was located" in refusal(tumortrack(*calibrate, 0.5))
+        with pytest.raises(InputError, match="was changed since it was located"):
+            command.run()
     finally:
         meta.write_bytes(written)
     manifest = store.read_json(model / store.MANIFEST)
     trust = {**manifest["trust"], "std_scale": 1.25}
     store.write_json(model / store.MANIFEST, {**manifest, "trust": trust})
     said = refusal(tumortrack("locate", case, cloud, tmp_path / "after"))
-    assert "margins.json is of another model, or this one was changed" in said
-    assert "begun with another model_sha256" in refusal(tumortrack(*calibrate, 0.5))
+    assert f"{NAME} is of another model, or this one was changed" in said
+    assert "Remove the file" in said
+    with pytest.raises(InputError, match="begun with another model_sha256"):
+        command.run()

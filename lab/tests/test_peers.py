@@ -150,6 +150,12 @@ def test_bound_knows_vertices_that_rounding_made_one():
     np.testing.assert_allclose(found, square + 7, atol=1e-4)
 
 
+def test_bound_knows_an_edge_that_bending_made_shorter_than_rounding():
+    square = np.array([[0.0, 0, 0], [100, 0, 0], [100, 100, 0], [0, 100, 0], [100, 100, 1.01e-3]])
+    rest = Mesh(square, np.array([[0, 1, 2], [2, 1, 4], [0, 4, 3]]))
+    np.testing.assert_array_equal(matched_vertices(rest, rest.moved(0.98 * square)), 0.98 * square)
+
+
 def test_bound_minimises_over_the_volume():
     """A ball stretched along x by a: the mean square over its volume is a^2 R^2 / 5."""
     ball = ellipsoid((30, 30, 30), (5, 6, 7), 4)

@@ -336,7 +336,7 @@ def test_a_table_goes_beside_the_document(tmp_path):
     assert list(spread_words(rows, "off")) == ["2.0 / 2.9 / 3.0", "–"]
 
 
-@pytest.mark.parametrize("name", ["results", "soak", "real", "world", "sequences", "trust"])
+@pytest.mark.parametrize("name", ["results", "soak", "real", "world", "sequences"])
 def test_scripts_are_imported_and_say_what_they_do(name, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", [f"{name}.py", "--help"])
     with pytest.raises(SystemExit) as stopped:

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from reports import report_of
 from tumortrack.core import store
+from tumortrack.core.assessment import Assessment, ErrorBound
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.rigid_fit import kabsch
@@ -281,10 +282,8 @@ def test_estimates_are_held_against_truth_and_rigid_pose_once_and_wrong_ones_nam
     )
     told = report_of(parts={"kidney": {}, "tumor_1": {}})
     said = Assessment(bounds={"tumor_1": ErrorBound(3.0)})
-    answer, asked = (
-        SimpleNamespace(quality="good", reason="", motion=motion, report=told, assessment=said),
-        [],
-    )
+    about = {"quality": "good", "reason": "", "motion": motion, "report": told, "assessment": said}
+    answer, asked = SimpleNamespace(**about), []
     monkeypatch.setattr(Tracker, "follow", lambda _, cloud, seen: asked.append(cloud) or answer)
     monkeypatch.setattr(estimates, "load_model", lambda *args, **how: None)
     monkeypatch.setattr(estimates, "Tracker", lambda model: Tracker.__new__(Tracker))

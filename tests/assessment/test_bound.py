@@ -12,6 +12,7 @@ import pytest
 from reports import reporting
 from tumortrack.assessment import bound, verdict
 from tumortrack.assessment.bound import POOR_MM, MissModel, bounds_of, figures, shipped
+from tumortrack.core.assessment import ErrorBound
 from tumortrack.core.types import DepthError, Look, SensorCloud
 from tumortrack.models.report import estimate_of
 from tumortrack.tracking.fingerprint import fingerprint
@@ -72,6 +73,30 @@ def test_a_miss_that_may_be_large_makes_an_answer_poor(slim_model, monkeypatch):
         monkeypatch.setattr(bound, "shipped", lambda model=model: model)
         found = tracker.locate(cloud, 16, 0).finding
         assert (None if found is None else found.kind) == kind
+
+
+def test_a_factor_multiplies_the_bound_and_so_decides(slim_model, monkeypatch):
+    model = load_model(slim_model, "cpu")
+    plain = MissModel(fingerprint(), math.log(0.8 * POOR_MM), {}, {})
+    monkeypatch.setattr(bound, "shipped", lambda: plain)
+    cloud = replace(visible(), depth_error=DepthError(0.0))
+    for factor, kind in ((1.0, None), (1.24, None), (1.26, "miss")):
+        found = Tracker(replace(model, bound_factor=factor)).locate(cloud, 16, 0)
+        said = found.assessment
+        assert said.factor == factor
+        bound_mm = said.bounds["tumor_1"].error_bound95_mm
+        assert bound_mm == pytest.approx(factor * 0.8 * POOR_MM)
+        assert (None if said.finding is None else said.finding.kind) == kind
+        assert bool(said.shown) == (kind is None)
+
+
+def test_an_organ_without_tumors_is_judged_by_its_own_bound(estimate):
+    organ = reporting(estimate)
+    alone = {"kidney": organ.report.parts["kidney"]}
+    report = organ.reporting(parts=alone, evidence=(), size=None, fit_cost=None).report
+    for bound_mm, kind in ((POOR_MM - 0.1, None), (POOR_MM + 0.1, "miss")):
+        finding = verdict._doubt(report, {"kidney": ErrorBound(bound_mm)})
+        assert (finding and finding.kind) == kind
 
 
 def test_a_method_that_does_not_know_enough_has_none_and_keeps_the_older_checks(estimate):

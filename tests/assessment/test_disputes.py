@@ -29,7 +29,7 @@ ELSEWHERE = told(FAR_MM, left_out=False)
 class Scripted(Tracker):
     """A tracker whose answers are good but for what their evidence says."""
 
-    anatomy_ct, model = None, SimpleNamespace(margins=None)
+    anatomy_ct, model = None, SimpleNamespace(bound_factor=1.0)
 
     def __init__(self, frames):
         self.frames = iter(frames)

@@ -10,6 +10,8 @@ import tumortrack as tt
 from live_objects import small_estimate
 from reports import poor
 from tumortrack.core import store
+from tumortrack.core.assessment import Assessment, ErrorBound
+from tumortrack.core.report import Cause, Finding, Likely, NextEvidence
 from tumortrack.core.types import CameraLabels
 from tumortrack.tracking.files import write_estimate
 
@@ -25,6 +27,24 @@ def test_what_was_written_is_read(tmp_path, finding):
     write_estimate(tmp_path / "run", stored(finding))
     back = tt.load_estimate(tmp_path / "run")
     assert (back.finding, back.quality) == (finding, "good" if finding is None else "poor")
+
+
+def test_an_assessment_survives_writing_and_reading(tmp_path):
+    said = Assessment(
+        bounds={"tumor_1": ErrorBound(4.5, (0.0, 0.6, 0.8)), "tumor_2": ErrorBound(np.float64(2))},
+        factor=1.25,
+        finding=Finding("miss", {"part": "t", "miss_mm": 4.5, "limit_mm": 4.0, "digits": "1"}),
+        causes=(Likely(Cause.SCALE, 1.5, 0.25), Likely(Cause.VIEW)),
+        advice=": look elsewhere",
+        next_evidence=(
+            NextEvidence(
+                kind="touch", part="tumor_1", place_mm=(1.0, 2.0, 3.0), direction=(0.0, 0.0, 1.0),
+                std_mm=2.0, then_std_mm=1.0,
+            ),
+        ),
+    )  # fmt: skip
+    write_estimate(tmp_path / "run", replace(stored(None), assessment=said))
+    assert tt.load_estimate(tmp_path / "run").assessment == said
 
 
 @pytest.mark.parametrize(

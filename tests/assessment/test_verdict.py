@@ -270,7 +270,7 @@ def test_a_model_that_was_mostly_wrong_says_so_in_every_estimate(slim_model, sta
     assert found.quality == "poor"
     assert "40 % of the simulated scenes on which this model was checked" in found.reason
     assert found.finding.kind == "model"
-    assert found.report.margin.stated == ()
+    assert found.assessment.shown == {}
     assert weakness_of({"validation_far": 0.1}) == weakness_of({}) == ""
     assert "without a network" in weakness_of({"half_turn_mm": 0.4})
 

@@ -150,7 +150,7 @@ def test_a_case_is_replaced_with_its_model_and_with_nothing_else(
     before = (new / "manifest.json").read_bytes()
     assert run(command) == 2
     assert "--overwrite" in capsys.readouterr().err
-    for stranger in (new / "notes.txt", new / "model" / "margins.json"):
+    for stranger in (new / "notes.txt", new / "model" / "bound_factor.json"):
         stranger.write_text("dear")
         assert run([*command, "--overwrite"]) == 2
         name = str(stranger.relative_to(new))
@@ -182,14 +182,14 @@ def test_train_says_that_nothing_needs_to_be_learnt(models_at_once, case, tmp_pa
     for option in (("--rotations", "full"), ("--seed", "1")):
         assert run([*command, *option]) == 2
         assert "another case, or with another seed or other options" in capsys.readouterr().err
-    (model / "margins.json").write_text("{}")
+    (model / "bound_factor.json").write_text("{}")
     for folder in (model, tmp_path / "mine", tmp_path / "begun"):
         (folder / "training").mkdir(parents=True, exist_ok=folder == model)
         (folder / "training" / "dear.txt").write_text("dear")
     (tmp_path / "mine" / "training").rename(tmp_path / "mine" / "notes")
     made = len(models_at_once)
     for folder, words in (
-        (model, "also holds margins.json, training, which would be lost"),
+        (model, "also holds bound_factor.json, training, which would be lost"),
         (tmp_path / "mine", "exists already. Choose another path."),
         (tmp_path / "begun", "is not a model that tumortrack wrote"),
     ):

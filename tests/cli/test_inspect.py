@@ -27,10 +27,9 @@ PARTS = {
 }  # fmt: skip
 RUN = {
     "quality": {"verdict": "poor", "reason": "the fit is worse than usual; look from elsewhere"},
-    "assessment": {"bounds": {"kidney": {"error_bound95_mm": 2.84}}},
+    "assessment": {"bounds": {"kidney": {"error_bound95_mm": 2.84}}, "factor": 1.25},
     "patient": PATIENT,
     "parts": PARTS,
-    "margin": {"stated": [], "reason": "a poor estimate has no margin"},
 }
 GOOD = {**RUN, "quality": {"verdict": "good", "reason": ""},
         "assessment": {**RUN["assessment"], "finding": None}}  # fmt: skip
@@ -66,10 +65,10 @@ def say(path: Path) -> str:
     ("content", "words"),
     [
         (RUN, ("a report of `locate`", "verdict: poor", 
-               "kidney: centre (1.0, -2.0, 150.0) mm, 180.1 ml", "tumor_1: not found",
-               "a poor estimate has no margin")),
+               "kidney: centre (1.0, -2.0, 150.0) mm, 180.1 ml", "tumor_1: not found")),
         (GOOD,
-         ("verdict: good", "kidney: centre (1.0, -2.0, 150.0) mm, off by at most 2.8 mm (95 %)")),
+         ("verdict: good", "kidney: centre (1.0, -2.0, 150.0) mm, off by at most 2.8 mm (95 %)",
+          "multiplied by 1.25")),
         ({"quality": {"verdict": "none", "reason": "only 3 points are left"}, "input": []},
          ("a report of `locate`", "verdict: none", "because only 3 points are left")),
         (TRACK, ("200 updates in 10.0 s, 20.0 a second: 75% good, 15% poor, 10% none",

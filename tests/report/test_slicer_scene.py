@@ -38,7 +38,7 @@ WRITES = "slicer_peer.py", "write"
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A case with a CT, and a run of its model with a stated margin."""
+    """A case with a CT, and a run of its model."""
     top = tmp_path_factory.mktemp("slicer")
     labels = kidney_labels((2.0, 2.0, 2.0))
     ct = Volume(np.where(labels.labels > 0, 100, -100).astype(np.float32), labels.lps_from_index)
@@ -48,7 +48,6 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     found = reporting(
         bounded(small_estimate(), tumor_1=5.04),
         motion={**NOWHERE, "camera_from_ct": CAMERA_FROM_CT.tolist()},
-        margin={"stated": [{"confidence": 0.95, "mm": {"tumor_1": 5.0}}]},
     )
     volume = CameraLabels(np.ones((4, 4, 4), np.uint8), np.eye(4))
     estimate = replace(found, volume=volume, motion=Shift())
@@ -138,8 +137,8 @@ def test_slicer_shows_a_run_and_the_ct_where_the_organ_is(folders, scenes) -> No
     np.testing.assert_allclose(RAS_FROM_LPS @ now_ras, CAMERA_FROM_CT @ point_lps, atol=1e-5)
     check_models(nodes, run, "kidney", "tumor_1", "tumor_1_margin", "tumor_2")
     places = {
-        "tumor_1, 95 % within 1.3 mm, 95 % margin 5.0 mm": np.array([14.0, -3, 120]),
-        "tumor_2, no margin stated": np.array([-6.0, 5, 138]),
+        "tumor_1, off by at most 5.0 mm (95 %)": np.array([14.0, -3, 120]),
+        "tumor_2": np.array([-6.0, 5, 138]),
     }
     check_points(nodes["tumors"], places)
     check_points(nodes["mapped_points"], {"A": np.array([11.0, 2, 3])})

@@ -351,20 +351,13 @@ def _recordings() -> dict[str, Target]:
 
 
 def _margins() -> dict[str, Target]:
-    from tumortrack.tracking import margins
-    from tumortrack.tracking.fingerprint import fingerprint
-    from tumortrack_lab.margins.table import head_of, open_table
+    from tumortrack.tracking import bound_factor
+    from tumortrack_lab.margins.factor import found_factor
+    from tumortrack_lab.margins.table import Row, head_of, open_table
 
-    shells = margins.Shells(
-        confidence=0.9, radii={"tumor": margins.Radius(used="constant", constant_mm=3.0)}
-    )
-    valid = margins.ModelMargins(
-        fingerprint=fingerprint(), tumortrack="0", model_sha256="", table_sha256="", seed=0,
-        widest_mm=8.0, limits={"rarity": 1.0}, shells=(shells,), groups=(), joined={},
-        risk_bound=0.1, accepted=1.0, missed=0.0,
-    )  # fmt: skip
-    margins.write_sealed(path := scratch() / "margins.json", valid)
-    row = {"scene": "s", "sha256": "", "label": ["a", "b", "c"], "misses": {"tumor": [[1.0, None]]}}
+    valid = found_factor([Row("s", "", ratio=1.0)] * 59, "", "", 0)
+    bound_factor.write_factor(path := scratch() / bound_factor.NAME, valid)
+    row = {"scene": "s", "sha256": "", "ratio": 1.0}
     table = "\n".join(map(json.dumps, (head_of("", 0), row)))
 
     def rows(path: Path) -> object:
@@ -372,7 +365,7 @@ def _margins() -> dict[str, Target]:
             return known
 
     return {
-        "margins": of_file(margins.read_sealed, "in.json", path.read_bytes()),
+        "bound factor": of_file(bound_factor.read_sealed, "in.json", path.read_bytes()),
         "margins table": of_file(rows, "in.jsonl", table),
     }
 

@@ -185,7 +185,12 @@ def _doubt(report: FitReport, bounds: Mapping[str, ErrorBound]) -> Finding | Non
     if 2 * depth_mm**2 > bound_mm**2:  # most of it
         return Finding("depths", {"depth_mm": depth_mm})
     digits = _telling(bound_mm, POOR_MM)
-    values = {"part": name, "miss_mm": bound_mm, "limit_mm": POOR_MM, "digits": digits}
+    values: dict[str, float | str | None] = {
+        "part": name,
+        "miss_mm": bound_mm,
+        "limit_mm": POOR_MM,
+        "digits": digits,
+    }
     return Finding("miss", values)
 
 

@@ -83,15 +83,12 @@ def _say_estimate(estimate: Estimate, located: Located) -> None:
     """The verdict, and where each part is."""
     from tumortrack.core.estimate import verdict_words
     from tumortrack.report.seen import next_lines, part_rows, row_words
-    from tumortrack.tracking.margins import margin_words
 
-    report, margin = estimate.report, estimate.report.margin
+    report = estimate.report
     say(verdict_words(estimate.quality, estimate.reason))
     say(str(estimate.patient))
     for row in part_rows(report, estimate.assessment):
         say(row_words(row))
-    if margin is None or not margin.stated:
-        say(margin_words(margin))
     for number, each in enumerate(report.evidence, start=1):
         say(f"{each.name} {number}: {each.off_mm:.1f} mm off{', left out' * each.left_out}")
     for line in next_lines(estimate):
@@ -104,13 +101,10 @@ def _say_estimate(estimate: Estimate, located: Located) -> None:
 def _say_written(estimate: Estimate, located: Located, out: Path) -> None:
     from tumortrack.registration.kernels import carry
     from tumortrack.report.seen import PAGE
-    from tumortrack.tracking.margins import stated_radius
 
     if located.points is not None:
-        radius = stated_radius(estimate.report.margin, "map")
-        margin = f"; {radius.words} for all of them" if radius else ""
         count, file = len(located.points.points_ct), out / "points.csv"
-        say(f"{count} points of the CT: their places are in {file}{margin}")
+        say(f"{count} points of the CT: their places are in {file}")
     seconds = estimate.report.timings["total"]
     compiled = ", with compiling, once on this machine" if carry.stats.cache_misses else ""
     say(f"written to {out} (camera frame, mm) in {seconds:.2f} s{compiled}; look at {out / PAGE}.")

@@ -8,6 +8,7 @@ from typing import Literal
 
 import msgspec
 
+from tumortrack.core.organ import is_tumor
 from tumortrack.core.report import Finding, Likely, NextEvidence, Point
 
 Quality = Literal["good", "poor", "none"]  # none: there is no estimate
@@ -60,6 +61,10 @@ class Assessment(msgspec.Struct, frozen=True, kw_only=True):
         return "" if self.finding is None else self.finding.words + self.advice
 
     @property
+    def factor_words(self) -> str:
+        return f"bounds are multiplied by {self.factor:.2f}, as found on scenes of known truth"
+
+    @property
     def shown(self) -> Mapping[str, ErrorBound]:
         """The bounds to be shown: a poor answer has none."""
         return self.bounds if self.finding is None else {}
@@ -67,6 +72,16 @@ class Assessment(msgspec.Struct, frozen=True, kw_only=True):
     def bound_words(self, part: str) -> str:
         """How far off a part is at most; empty: not known, or the answer is poor."""
         return self.shown[part].words if part in self.shown else ""
+
+
+def deciding(bounds: Mapping[str, ErrorBound]) -> Mapping[str, ErrorBound]:
+    """Those of the tumors, or else of the organ."""
+    return {name: bound for name, bound in bounds.items() if is_tumor(name)} or bounds
+
+
+def bound_words(bounds: Mapping[str, ErrorBound]) -> str:
+    """How far off the tumors are at most, or else the organ; empty: not known."""
+    return ", ".join(f"{name} {bound.words}" for name, bound in deciding(bounds).items())
 
 
 def centre_label(name: str, bounds: Mapping[str, ErrorBound], poor: bool) -> str:

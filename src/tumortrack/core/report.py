@@ -15,14 +15,14 @@ from tumortrack.core.tables import read_table
 
 Point = tuple[float, float, float]
 
-# Which check an estimate failed; other: of a moment, a margin or the model. none: no estimate.
+# Which check an estimate failed; other: of a moment, or the model. none: no estimate.
 Check = Literal[
     "poses", "fit", "strays", "seen_through", "unseen", "size", "place", "other", "none"
 ]
 Kind = Literal[
     "not_judged", "poses", "strays", "fit", "size", "upside_down", "tilted", "not_turned", "rival",
     "missing", "unsure", "miss", "depths", "improbable", "seen_through", "unseen", "hidden_now",
-    "evidence", "disputed", "beyond_margins", "model", "frame_in_doubt", "good_again",
+    "evidence", "disputed", "model", "frame_in_doubt", "good_again",
     # No estimate: the frame or its source.
     "no_frame", "source", "defect", "stamp_negative", "stamp_back", "stale", "future", "too_late",
     "frozen", "other_frame_id", "frame_id_changed", "intrinsics_changed", "moved", "cameras",
@@ -242,24 +242,11 @@ class MotionReport(_Value, frozen=True, kw_only=True):
     depth_share: float = 0.0  # not stated by runs of before
 
 
-class StatedMargin(_Value, frozen=True, kw_only=True):
-    """Radii by part, mm, that hold with this confidence; ``map``: of any mapped point."""
-
-    confidence: float
-    mm: dict[str, float]
-
-
-class MarginReport(_Value, frozen=True, kw_only=True):
-    """``stated`` by rising confidence; or none, and the ``reason``."""
-
-    stated: tuple[StatedMargin, ...] = ()
-    reason: str = ""
-
-
 class ScanReport(_Value, frozen=True, kw_only=True):
-    """Standard deviation of the least sure tumor's centre with one look, two, ..."""
+    """How far off the least sure tumor is at most (95 %) with one look, two, ...; without one, the
+    organ."""
 
-    center_std_mm: tuple[float, ...]
+    error_bound95_mm: tuple[float, ...]
 
 
 class FitReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
@@ -294,7 +281,6 @@ class FitReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     seen_through: float | None = None
     in_sight: float | None = None
     doubted_in_sight: float | None = None
-    margin: MarginReport | None = None
     cameras: tuple[int, ...] = ()
     piece: int = 0
     scan: ScanReport | None = None

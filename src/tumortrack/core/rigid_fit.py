@@ -30,7 +30,9 @@ def matched_vertices(rest: Mesh, moved: Mesh) -> Float64[np.ndarray, "_ 3"]:
     """The place in ``moved`` of each vertex of ``rest``, by triangles: reading a mesh merges and
     reorders vertices but keeps the order of triangles. Raises InputError: it has others."""
     vertex = np.full(len(rest.vertices_mm), -1)
-    before, after = (_wide_faces(mesh) for mesh in (rest, moved))
+    before, after = rest.faces, moved.faces
+    if len(before) != len(after):
+        before, after = (_wide_faces(mesh) for mesh in (rest, moved))
     same = before.shape == after.shape
     if same:
         vertex[before.reshape(-1)] = after.reshape(-1)

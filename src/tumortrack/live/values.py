@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt8
 
-from tumortrack.core.assessment import ErrorBound, Quality
+from tumortrack.core.assessment import ErrorBound, Quality, bound_words
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate
@@ -30,7 +30,6 @@ from tumortrack.core.halt import Halt
 from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.report import Finding
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
-from tumortrack.tracking.margins import margin_words
 
 if TYPE_CHECKING:
     from tumortrack.sense.region.tissue import Click, TissueClassifier
@@ -337,8 +336,8 @@ class TrackingResult:
             return f"none, no estimate: {self.reason}"
         by = self.beside and f"; {self.beside}"
         if self.quality == "good":
-            margins = margin_words(self.estimate.report.margin)
-            return f"good: {NO_CHECK_FAILED}; {UNVERIFIED}; {margins}{by}"
+            bounds = bound_words(self.bounds)
+            return f"good: {NO_CHECK_FAILED}; {UNVERIFIED}{bounds and f'; {bounds}'}{by}"
         return f"{self.quality}: {self.warning}{by}"
 
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float64
 
+from tumortrack.core.assessment import deciding
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.evidence import Evidence
@@ -205,12 +206,12 @@ class Scan:
         whole = estimates[-1]
         if whole.quality != "good":
             raise NoEstimate(Finding("scan_poor", {"reason": whole.reason}))
-        least_sure_mm = [_least_sure_mm(estimate) for estimate in estimates]
-        whole = whole.reporting(scan=ScanReport(center_std_mm=tuple(least_sure_mm)))
-        steps = ", then ".join(f"{mm:.1f} mm" for mm in least_sure_mm)
+        bounds_mm = tuple(_least_sure_mm(estimate) for estimate in estimates)
+        whole = whole.reporting(scan=ScanReport(error_bound95_mm=bounds_mm))
+        steps = ", then ".join(f"{mm:.1f} mm" for mm in bounds_mm)
         self.summary = (
-            f"scan: the least sure tumor's centre has a standard deviation of {steps}, with one "
-            f"to {SCAN_LOOKS} looks"
+            f"scan: the least sure tumor was off by at most {steps} (95 %), with one to "
+            f"{SCAN_LOOKS} looks"
         )
         return whole
 
@@ -231,9 +232,9 @@ def _towards(view: CameraView, organ: SensorCloud) -> Float64[np.ndarray, " 3"]:
 
 
 def _least_sure_mm(estimate: Estimate) -> float:
-    """One standard deviation of the centre of the tumor, or else the organ, that is least sure."""
-    parts = list((estimate.report.tumors or estimate.report.parts).values())
-    return max(part.center_std_mm or 0.0 for part in parts)
+    """How far off the tumor, or else the organ, that is least sure is at most."""
+    bounds = deciding(estimate.assessment.bounds).values()
+    return max((bound.error_bound95_mm for bound in bounds), default=0.0)
 
 
 def camera_words(numbers: list[int], absent: dict[int, str]) -> str:

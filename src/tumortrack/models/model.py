@@ -14,7 +14,6 @@ from tumortrack.models.in_distribution import InDistributionRange
 
 if TYPE_CHECKING:
     from tumortrack.simulate.scene import SceneConfig
-    from tumortrack.tracking.margins import ModelMargins
 
 
 class ModelConfig(Config, frozen=True):
@@ -28,14 +27,14 @@ class ModelConfig(Config, frozen=True):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Model(ABC):
-    """What locates one patient's organ. ``provenance``: seeds, steps, hashes; ``margins``: None
-    where it was not calibrated."""
+    """What locates one patient's organ. ``provenance``: seeds, steps, hashes; ``bound_factor``: by
+    which error bounds are multiplied, as found on scenes of known truth (1: not tried)."""
 
     config: ModelConfig
     parts: tuple[str, ...]
     in_distribution: InDistributionRange
     provenance: dict[str, Any] = field(default_factory=dict)
-    margins: ModelMargins | None = None
+    bound_factor: float = 1.0
 
     @property
     def patient(self) -> Patient:

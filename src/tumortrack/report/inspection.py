@@ -110,11 +110,11 @@ def _with_figures(content: Content, folder: Path) -> Content:
         from tumortrack.core.assessment import Assessment
         from tumortrack.core.report import FitReport
         from tumortrack.report.seen import part_rows, row_words
-        from tumortrack.tracking.margins import margin_words
 
         report = msgspec.convert(content, FitReport)
         assessment = msgspec.convert(content.get("assessment", {}), Assessment)
-        figures["margin_words"] = margin_words(report.margin)
+        if assessment.factor != 1.0:
+            figures["factor_words"] = assessment.factor_words
         figures["rows"] = [row_words(row) for row in part_rows(report, assessment)]
     elif "updates" in content:
         counts = *content["estimates"].values(), content["no_estimate"]
@@ -142,15 +142,12 @@ def _of_the_cases_model(case: Path) -> Content:
 
 def _of_model(manifest: Content, folder: Path) -> Content:
     from tumortrack.models.folder import training_words, weakness_of
-    from tumortrack.tracking.margins import UNKNOWN, described, read_margins
+    from tumortrack.tracking.bound_factor import read_factor
 
-    about, margins = manifest["provenance"], read_margins(folder)
+    about, found = manifest["provenance"], read_factor(folder)
     trained = "trained for " * ("network" in manifest["config"])
-    return {
-        "known": trained + training_words(about),
-        "weakness": weakness_of(about),
-        "margins": described(margins) if margins else [UNKNOWN],
-    }
+    known = {"known": trained + training_words(about), "weakness": weakness_of(about)}
+    return known if found is None else {**known, "factor_words": found.words}
 
 
 def _artifact(folder: Path) -> Iterable[str]:

@@ -33,7 +33,6 @@ from tumortrack.report.seen import PAGE, Seen, next_evidence, next_lines, part_r
 from tumortrack.report.wrapping import wrapped
 from tumortrack.sense.camera import deproject
 from tumortrack.sense.region.working_image import ORGAN, sampled_pixels
-from tumortrack.tracking.margins import margin_words
 from tumortrack.tracking.slices import ORIENTATIONS, outlined, plane_through
 
 PICTURE = "picture.png"
@@ -96,9 +95,8 @@ def _figures(panels: list[Panel]) -> str:
 def _lines(report: dict[str, Any], estimate: Estimate | None) -> Iterator[str]:
     patient = _sentence(str(patient_in(report.get("patient"), "report")))
     yield f"{patient}. Camera frame: x right, y down, z away."
-    margin = None if estimate is None else estimate.report.margin
-    if estimate is not None and not (margin and margin.stated):
-        yield f"{_sentence(margin_words(margin))}."
+    if estimate is not None and estimate.assessment.factor != 1.0:
+        yield f"{_sentence(estimate.assessment.factor_words)}."
     yield from (view["words"] for view in report.get("input", ()))
     yield from (f"Note: {note}" for note in report.get("notes", ()))
     yield from map(_sentence, next_lines(estimate))

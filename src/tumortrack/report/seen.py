@@ -11,7 +11,6 @@ from jaxtyping import UInt8
 
 from tumortrack.core.report import FAR_OFF, FitReport, NextEvidence
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.tracking.margins import stated_radius
 
 if TYPE_CHECKING:
     from tumortrack.core.assessment import Assessment
@@ -39,16 +38,15 @@ class Seen:
 
 
 def part_rows(report: FitReport, assessment: Assessment) -> list[dict[str, str]]:
-    """For each part its name, centre, how far off that is at most (95 %), volume and margin, with
-    units; empty if not known. A poor estimate has no bounds."""
+    """For each part its name, centre, how far off it is at most, and volume, with units; empty if
+    not known. A poor estimate has no bounds."""
     rows = []
     for name, part in report.parts.items():
-        row = {"part": name, "centre": "not found", "bound": "", "volume": "", "margin": ""}
+        row = {"part": name, "centre": "not found", "bound": "", "volume": ""}
         if part.center_mm is not None:
-            (x, y, z), radius = part.center_mm, stated_radius(report.margin, name)
+            x, y, z = part.center_mm
             row |= {"centre": f"({x:.1f}, {y:.1f}, {z:.1f}) mm"}
-            row |= {"volume": f"{part.volume_ml:.1f} ml", "margin": radius.words if radius else ""}
-            row |= {"bound": assessment.bound_words(name)}
+            row |= {"volume": f"{part.volume_ml:.1f} ml", "bound": assessment.bound_words(name)}
         rows.append(row)
     return rows
 
@@ -68,5 +66,5 @@ def next_lines(estimate: Estimate | None) -> list[str]:
 
 
 def row_words(row: dict[str, str]) -> str:
-    words = (f"centre {row['centre']}", row["bound"], row["volume"], row["margin"])
+    words = (f"centre {row['centre']}", row["bound"], row["volume"])
     return f"{row['part']}: {', '.join(filter(None, words)).replace('centre not', 'not')}"

@@ -143,8 +143,8 @@ class Scene:
             self._add_points(CENTRES, centres)
 
     def add_run(self, folder: Path, stored: dict[str, Any]) -> None:
-        """The result of `locate`: segmentation, surfaces, margins, tumor centres labelled with
-        their uncertainty, and mapped points; camera frame. ``stored``: its report.json."""
+        """The result of `locate`: segmentation, surfaces, shells, tumor centres labelled with how
+        far off they are at most, and mapped points; camera frame. ``stored``: its report.json."""
         report = msgspec.convert(stored, FitReport)
         assessment = msgspec.convert(stored["assessment"], Assessment)
         voxels = (folder / "labels.seg.nrrd").read_bytes()
@@ -198,7 +198,6 @@ class Scene:
             "opacity": f"{opacity:g}",
             "visibility2D": "true",
             "backfaceCulling": "false",
-            "activeScalarName": "std_mm",
             "scalarVisibility": "false",
         }
         file = None if content is None else ("ModelStorage", f"{name}.ply", content)

@@ -27,7 +27,6 @@ from tumortrack.core.types import CameraLabels, OccupancyCloud
 from tumortrack.imaging.nifti import read_nifti, write_nifti
 from tumortrack.imaging.segmentation_files import segments, write_seg_nrrd
 from tumortrack.sense.ply import parse_ply_properties, write_cloud_ply
-from tumortrack.tracking.margins import stated_radius
 from tumortrack.tracking.points import PointTable, camera_table
 
 MARGIN = "_margin"  # suffix of the names of shells
@@ -47,7 +46,7 @@ def write_estimate(
     - occupancy.ply: points with label, probability and, if known, their place in the CT
     - labels.nii.gz (voxel -> camera frame, mm), labels.seg.nrrd (the same for 3D Slicer)
     - kidney.ply (or the organ's name), tumor_1.ply, ..., and structures
-    - tumor_1_margin.ply, ...: shells of the highest confidence, if margins are stated
+    - tumor_1_margin.ply, ...: shells at the tumors' error bounds; of a good answer
     - points.csv: the given ``points`` of the CT and where they are now
     - report.json, with the further entries ``about``; and what ``add`` writes into the folder
 
@@ -71,9 +70,9 @@ def write_estimate(
         write_seg_nrrd(new / "labels.seg.nrrd", labels, affine, parts)
         for name, mesh in estimate.meshes.items():
             write_mesh(new / f"{name}.ply", mesh)
-            margin = stated_radius(estimate.report.margin, name)
-            if margin is not None and is_tumor(name):
-                write_mesh(new / f"{name}{MARGIN}.ply", exact_margin(mesh, margin.mm))
+            if is_tumor(name) and (bound := estimate.assessment.shown.get(name)):
+                shell = exact_margin(mesh, bound.error_bound95_mm)
+                write_mesh(new / f"{name}{MARGIN}.ply", shell)
         for name, mesh in estimate.structures.items():
             write_mesh(new / f"{name}.ply", mesh)
         if points is not None:

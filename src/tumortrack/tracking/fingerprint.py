@@ -11,8 +11,8 @@ _ANSWERS = "answers.json"
 
 @cache
 def fingerprint() -> str:
-    """Of the answers that come with this version: places of 30 scenes, and the figures that margins
-    limit. ``make fingerprint`` records them again once a place is more than 0.05 mm from what is
+    """Of the answers that come with this version: places of 30 scenes, and figures of the
+    fit. ``make fingerprint`` records them again once a place is more than 0.05 mm from what is
     recorded, or a figure by 2 %. What was measured with another fingerprint is of another method.
     """
     content = files("tumortrack.tracking").joinpath(_ANSWERS).read_bytes()

@@ -28,7 +28,7 @@ from tumortrack.models.in_distribution import InDistributionRange
 from tumortrack.models.method import method_of_folder
 from tumortrack.models.model import Model
 from tumortrack.registration.model import RegistrationModel
-from tumortrack.tracking.margins import read_margins
+from tumortrack.tracking.bound_factor import read_factor
 from tumortrack.tracking.presets import clinic, seen_by
 
 if TYPE_CHECKING:
@@ -37,20 +37,19 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int], None]
 
 
-def load_model(folder: Path, device: str = "auto", with_margins: bool = True) -> Model:
+def load_model(folder: Path, device: str = "auto") -> Model:
     """Read a model folder, or the model of a case folder, which is made if there is none yet.
 
     Args:
         device: where a network runs.
-        with_margins: read the margins too, if the model was calibrated.
 
     Raises:
-        ArtifactError: missing, of another schema, damaged or changed; its margins are of another
-            model or version of the method; CUDA is requested without a GPU.
+        ArtifactError: missing, of another schema, damaged or changed; its bound factor is of
+            another model or version of the method; CUDA is requested without a GPU.
         PackageError: the method that made it is not installed.
     """
     if holds_case(folder):
-        return case_model(load_case(folder), with_margins)
+        return case_model(load_case(folder))
     manifest = read_model_manifest(folder)
     try:
         known = {
@@ -59,7 +58,7 @@ def load_model(folder: Path, device: str = "auto", with_margins: bool = True) ->
                 manifest["familiar"], InDistributionRange, f"{folder}: familiar"
             ),
             "provenance": dict(manifest["provenance"]),
-            "margins": read_margins(folder) if with_margins else None,
+            "bound_factor": 1.0 if (found := read_factor(folder)) is None else found.factor,
         }
         model: Model
         if has_shape(manifest):
@@ -81,7 +80,7 @@ def load_model(folder: Path, device: str = "auto", with_margins: bool = True) ->
         ) from error
 
 
-def case_model(case: Case, with_margins: bool = True, progress: Progress | None = None) -> Model:
+def case_model(case: Case, progress: Progress | None = None) -> Model:
     """The model in a case's folder; if that has none of this case, a new one, which is saved there.
     ``progress``: of making one.
 
@@ -94,7 +93,7 @@ def case_model(case: Case, with_margins: bool = True, progress: Progress | None 
         return make_model(case, progress=progress)
     kept = case.folder / case.MODEL
     if is_model_of(kept, case.folder):
-        return load_model(kept, with_margins=with_margins)
+        return load_model(kept)
     if not os.access(case.folder, os.W_OK):
         raise StorageError(
             f"{case.folder} holds no model yet, and none can be written there. Copy the case to "

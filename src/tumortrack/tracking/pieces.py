@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from tumortrack.assessment.bound import POOR_MM
 from tumortrack.assessment.verdict import explained
+from tumortrack.core.assessment import deciding
 from tumortrack.core.errors import NoEstimate, NotThisOrgan
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import DepthFrame, Look
@@ -59,7 +60,8 @@ def _doubted(estimate: Estimate) -> bool:
 
 def _sure(estimate: Estimate) -> bool:
     """Whether nothing speaks for another piece, and the tumors' places are determined."""
-    bounds_mm = [each.error_bound95_mm for each in estimate.assessment.bounds.values()]
+    bounds = deciding(estimate.assessment.bounds).values()
+    bounds_mm = [bound.error_bound95_mm for bound in bounds]
     return not _doubted(estimate) and max(bounds_mm, default=0.0) < _UNDETERMINED * POOR_MM
 
 

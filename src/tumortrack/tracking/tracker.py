@@ -34,7 +34,6 @@ from tumortrack.registration.motion import ElasticMotion, seen_from_first
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import RegionConfig
 from tumortrack.sense.smoothing import clean_cloud
-from tumortrack.tracking.margins import stated_margin, with_margin
 from tumortrack.tracking.model_files import case_model
 from tumortrack.tracking.pieces import likeliest_piece
 
@@ -117,11 +116,11 @@ class Tracker:
             looks = (Look(replace(alone, stamp_ns=cloud.stamp_ns), cloud, HERE),)
 
         def located(looks: Sequence[Look]) -> Estimate:
-            return _judged(self._locator.locate(looks, grid, seed, pieces), looks, False)
+            return self._judged(self._locator.locate(looks, grid, seed, pieces), looks, False)
 
         with self._explaining_errors(looks, _DEFAULTS, bool(pieces)):
             estimate, looks = likeliest_piece(looks, located)
-        return self._explained(self._with_models_word(estimate, looks), looks, _DEFAULTS)
+        return self._explained(self._with_models_word(estimate), looks, _DEFAULTS)
 
     def follow(
         self,
@@ -142,19 +141,30 @@ class Tracker:
             how = msgspec.structs.replace(how, evidence=(*how.evidence, *pieces))
 
         def located(looks: Sequence[Look]) -> Estimate:
-            return _judged(self._locator.follow(looks, last, how), looks, strictly, last)
+            return self._judged(self._locator.follow(looks, last, how), looks, strictly, last)
 
         with self._explaining_errors(looks, how, bool(pieces or (last and last.evidence))):
             estimate, looks = likeliest_piece(looks, located, most=1)  # a frame may not wait
-        return self._explained(self._with_models_word(estimate, looks), looks, how)
+        return self._explained(self._with_models_word(estimate), looks, how)
 
-    def _with_models_word(self, estimate: Estimate, looks: Sequence[Look]) -> Estimate:
-        """The estimate with what the model says: its weakness, its margins, whose it is."""
+    def _judged(
+        self,
+        estimate: Estimate,
+        looks: Sequence[Look],
+        strictly: bool,
+        last: Estimate | None = None,
+    ) -> Estimate:
+        start = time.perf_counter()
+        estimate = judged(estimate, looks, strictly, self.model.bound_factor)
+        if last is not None:
+            estimate = doubt_if_hidden(estimate, last)
+        return _timed(estimate, "judge", start)
+
+    def _with_models_word(self, estimate: Estimate) -> Estimate:
+        """The estimate with what the model says: its weakness, whose it is."""
         start = time.perf_counter()
         if self._weakness:
             estimate = estimate.assessed(finding=Finding("model", {"words": self._weakness}))
-        margins = self.model.margins if len(looks) == 1 else None  # calibrated on single looks
-        estimate = with_margin(estimate, looks[0].cloud, margins)
         estimate = replace(estimate, patient=self._patient, organ=self._organ)
         return _timed(estimate, "judge", start)
 
@@ -200,16 +210,6 @@ class Tracker:
     def warm(self) -> None:
         """Load and compile what the first call of ``follow`` would otherwise wait for."""
         self._locator.warm()
-
-
-def _judged(
-    estimate: Estimate, looks: Sequence[Look], strictly: bool, last: Estimate | None = None
-) -> Estimate:
-    start = time.perf_counter()
-    estimate = judged(estimate, looks, strictly)
-    if last is not None:
-        estimate = doubt_if_hidden(estimate, last)
-    return _timed(estimate, "judge", start)
 
 
 def _parted(
@@ -382,10 +382,6 @@ class Follower:
         finding = self.disputes.update(estimate)
         if finding is None or estimate.finding is not None:
             return estimate
-        margins = self._tracker.model.margins
-        if estimate.report.margin is not None:
-            margin = stated_margin(estimate.report, margins, False)
-            estimate = estimate.reporting(margin=margin)
         return estimate.assessed(finding=finding)
 
     def _earlier(self, stamp_ns: int, camera_from_last: Affine) -> tuple[Any, ...]:

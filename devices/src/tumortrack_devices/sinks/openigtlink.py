@@ -20,7 +20,6 @@ from tumortrack.core.mesh_query import rough_margin
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 from tumortrack.tracking.files import CENTRES, CT, MARGIN
-from tumortrack.tracking.margins import stated_radius
 from tumortrack_devices.beside import Beside
 from tumortrack_devices.igtl import message as igtl
 from tumortrack_devices.igtl.link import Link
@@ -72,12 +71,12 @@ class OpenIgtLinkSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="openigtl
 
 class OpenIgtLinkSink:
     """Per result: STATUS ``tumortrack``, TRANSFORM of each tumor, POINT ``tumors`` (their centres,
-    labelled with their uncertainty), POINT ``next_touch`` (the best places of the organ to touch
-    next, from the first advice on), and POLYDATA of each part and of each stated margin.
+    labelled with how far off they are at most), POINT ``next_touch`` (the best places of the organ
+    to touch next, from the first advice on), and POLYDATA of each part and, round each tumor, of a
+    shell as far off as it may be.
 
-    With a motion TRANSFORM ``ct`` is the organ's pose, and vertices of tumors have the scalar
-    ``std_mm``: one standard deviation along the least certain axis. Without an estimate STATUS says
-    why, no transform is sent, not to a new receiver either, and all else is empty.
+    With a motion TRANSFORM ``ct`` is the organ's pose. Without an estimate STATUS says why, no
+    transform is sent, not to a new receiver either, and all else is empty.
 
     With arms also STATUS ``arms`` (OK: its name is their state; not ready: halted, and why; not
     present: unknown), and a TRANSFORM of each tool tip, named as its shape (``cutter/tip``): from
@@ -192,7 +191,7 @@ class OpenIgtLinkSink:
                 if (mesh := meshes.get(name)) is None:
                     contents[name] = _NOTHING
                 elif due:
-                    contents[name] = self._surface(mesh, self._deviations(result, name))
+                    contents[name] = self._surface(mesh)
             contents |= self._shells(result, meshes, due)
         if self._config.cloud_hz:
             if estimate is None:
@@ -210,28 +209,17 @@ class OpenIgtLinkSink:
     def _shells(
         self, result: TrackingResult, meshes: dict[str, Mesh], due: bool
     ) -> dict[str, Polydata]:
-        """The surfaces of the tumors' stated margins; empty for one that is no longer stated."""
-        margin = None if result.estimate is None else result.estimate.report.margin
+        """The tumors' surfaces, wider by how far off they are at most; empty where that is not
+        known any more."""
         contents: dict[str, Polydata] = {}
         for name in self._context.parts[1:]:
-            mesh, radius, shell = meshes.get(name), stated_radius(margin, name), name + MARGIN
-            if mesh is None or radius is None:
+            mesh, bound, shell = meshes.get(name), result.bounds.get(name), name + MARGIN
+            if mesh is None or bound is None:
                 contents |= {shell: _NOTHING} if shell in self._margins else {}
             elif due:
                 self._margins.add(shell)
-                contents[shell] = self._surface(rough_margin(mesh, radius.mm))
+                contents[shell] = self._surface(rough_margin(mesh, bound.error_bound95_mm))
         return contents
 
-    def _surface(self, mesh: Mesh, scalars: dict[str, np.ndarray] | None = None) -> Polydata:
-        points_mm = transform_points(self._axes, mesh.vertices_mm)
-        return Polydata(points_mm, mesh.faces, scalars=scalars or {})
-
-    def _deviations(self, result: TrackingResult, name: str) -> dict[str, np.ndarray]:
-        """``std_mm`` of each vertex of a tumor, where the method knows it."""
-        parts, anatomy = self._context.parts, self._context.anatomy_ct
-        motion = None if result.estimate is None else result.estimate.motion
-        if motion is None or anatomy is None or name not in parts[1:]:
-            return {}
-        vertices_ct = anatomy.parts[parts.index(name)].vertices_mm
-        std_mm = motion.largest_std_mm(vertices_ct)
-        return {} if std_mm is None else {"std_mm": std_mm}
+    def _surface(self, mesh: Mesh) -> Polydata:
+        return Polydata(transform_points(self._axes, mesh.vertices_mm), mesh.faces)

@@ -58,8 +58,8 @@ class ViewerSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
         host: who may watch, and stop arms: 127.0.0.1, this machine; 0.0.0.0, all that can reach it;
             or a name of this machine, which is then allowed in the page's address.
         case: folder of the patient's case, of whose CT (or labels) slices are shown.
-        margin_mm: a fixed distance of the shell around each tumor; 0: no shell; default: the margin
-            that the model states for the estimate, if any.
+        margin_mm: a fixed distance of the shell around each tumor; 0: no shell; default: how far
+            off the tumor is at most (95 %).
         hz: limit for clouds and surfaces.
     """
 

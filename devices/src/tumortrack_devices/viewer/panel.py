@@ -17,7 +17,6 @@ from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED
 from tumortrack.core.patient import NOBODY
 from tumortrack.core.report import FitReport
 from tumortrack.live.values import Controls, TrackingResult, Workcell
-from tumortrack.tracking.margins import margin_words, stated_radius
 from tumortrack.tracking.slices import ORIENTATIONS
 from tumortrack_devices.viewer.look import View
 from tumortrack_devices.viewer.scene import DisplayOptions
@@ -147,7 +146,7 @@ class StatusPanel:
         return f"no estimate: {self.result.reason}" if self.state == "none" else self.result.warning
 
     def numbers(self) -> str:
-        """Each part's volume, bound and margin; latency and age."""
+        """Each part's volume and bound; latency and age."""
         result = self.result
         if result is None:
             return ""
@@ -168,14 +167,11 @@ class StatusPanel:
     def _parts(self, report: FitReport) -> str:
         """A row for each part, with and without an estimate: nothing below must jump. After a
         failed check the bound is not valid, and left out."""
-        margins = report.margin
         bounds = self.result.bounds if self.result and self.state == "good" else {}
-        stated = margins.stated[-1].confidence if margins and margins.stated else None
         heads = ["", "volume", "off by at most (95 %)"]
-        heads += [f"{100 * stated:g} % margin"] if stated else []
         rows = []
         for label, name in enumerate(self.parts, start=1):
-            part, margin = report.parts.get(name), stated_radius(margins, name)
+            part = report.parts.get(name)
             volume_ml = part.volume_ml if part else None
             bound = bounds.get(name)
             cells = [
@@ -185,11 +181,8 @@ class StatusPanel:
                 "–" if volume_ml is None else f"{volume_ml:.1f} ml",
                 "–" if bound is None else f"{bound.error_bound95_mm:.1f} mm",
             ]
-            cells += [f"{margin.mm:.1f} mm" if margin else "–"] if stated else []
             rows.append(f"<tr><td>{'</td><td>'.join(cells)}</td></tr>")
-        table = f"<table><tr><th>{'</th><th>'.join(heads)}</th></tr>{''.join(rows)}</table>"
-        none = escape(margin_words(margins)) if report.parts and not stated else ""
-        return f"{table}<div class='tumortrack-none'>{none}</div>"
+        return f"<table><tr><th>{'</th><th>'.join(heads)}</th></tr>{''.join(rows)}</table>"
 
 
 def _over(edge: str, size: str, colour: Colour, text: str, why: str) -> str:
@@ -274,14 +267,8 @@ class Panel:
         with gui.add_folder("Show"):
             shown |= {
                 "organ": gui.add_slider(label, 0.0, 1.0, 0.05, default.organ),
-                "margin": gui.add_checkbox("Margins", default.margin),
+                "margin": gui.add_checkbox("Where the tumors may be (95 %)", default.margin),
                 "structures": gui.add_checkbox("Structures", default.structures),
-                "ellipsoids": gui.add_checkbox(
-                    "95 % ellipsoids (diagnostic)",
-                    default.ellipsoids,
-                    hint="95 % ellipsoid of each tumor's centre by the fit's own covariance, 2.80 "
-                    "standard deviations: a diagnostic, not the margin",
-                ),
                 "evidence": gui.add_checkbox(
                     "Evidence, next touches",
                     default.evidence,

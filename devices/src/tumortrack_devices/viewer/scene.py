@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -20,7 +20,6 @@ from tumortrack.core.mesh_query import exact_margin, rough_margin, surface_dista
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.live import values as live
 from tumortrack.live.values import TrackingResult, TransformedEstimate
-from tumortrack.tracking.margins import stated_radius
 from tumortrack.tracking.slices import SlicePlane
 from tumortrack_devices.beside import Beside, NextTouch
 from tumortrack_devices.display import MOST_SEEN, seen_colours, seen_points, thinned, wxyz_of
@@ -31,9 +30,6 @@ if TYPE_CHECKING:
     from viser import MeshHandle, PointCloudHandle, ViserServer
 
 _MOST_LABELLED = 15_000  # points shown
-# Standard deviations of the ellipsoid that contains 95 % of a trivariate normal distribution: the
-# root of the 95 % quantile of chi squared with three degrees of freedom.
-_ELLIPSOID = 2.7955
 _TUMOR_WITH_POINTS = 0.3  # opacity
 _SEEN_MM, _ORGAN_MM = 0.15, 0.15  # size of points: small, they lie over the tumors
 _CLICKABLE_MM = 1.0  # of observed points, while a click is expected
@@ -57,7 +53,6 @@ class DisplayOptions:
     organ: float = 0.35  # opacity
     margin: bool = True
     structures: bool = True
-    ellipsoids: bool = False
     evidence: bool = True  # and what to touch next
     points: str = "none"  # none | tumors | all
     slice_plane: bool = False
@@ -98,7 +93,7 @@ class ViewerScene:
             "/picked", radius=1.5, color=colours.PICKED, visible=False, cast_shadow=False
         )
         nodes.add_frame("/estimate", show_axes=False)
-        self._shells, self._parts, self._ellipsoids = {}, {}, {}
+        self._shells, self._parts = {}, {}
         self._name = context.parts[0]
         for label, name in enumerate(context.parts, start=1):
             look = {"color": colours.part_colour(label), "visible": False}
@@ -109,10 +104,6 @@ class ViewerScene:
             opacity = 0.35 if label == 1 else None
             path = f"/estimate/{name}"
             self._parts[name] = self._mesh(path, _NOTHING, opacity=opacity, **look)
-            if label > 1:
-                path = f"/estimate/ellipsoid_{name}"
-                look |= {"color": colours.WHITE, "opacity": 0.8}
-                self._ellipsoids[name] = self._mesh(path, _NOTHING, **look)
         self._structures = {}
         for number, name in enumerate(context.structures):
             colour = colours.structure_colour(number)
@@ -204,7 +195,7 @@ class ViewerScene:
     def hide(self) -> None:
         """Remove the estimate. Surfaces are emptied, not made invisible: browsers show one a frame
         later than the other, and old surfaces must not reappear."""
-        for group in (self._parts, self._shells, self._ellipsoids, self._structures):
+        for group in (self._parts, self._shells, self._structures):
             for node in group.values():
                 _put_mesh(node, _NOTHING)
         self._put_beside(Beside())
@@ -225,12 +216,9 @@ class ViewerScene:
         for name, node in self._parts.items():
             node.visible = name != self._name or options.organ > 0
             if name != self._name:  # opaque, except to show its inside
-                inside = options.points != "none" or options.ellipsoids
-                node.opacity = _TUMOR_WITH_POINTS if inside else None
+                node.opacity = _TUMOR_WITH_POINTS if options.points != "none" else None
         for node in self._shells.values():
             node.visible = options.margin
-        for node in self._ellipsoids.values():
-            node.visible = options.ellipsoids
         for node in self._structures.values():
             node.visible = options.structures
         for spots in self._spots.values():
@@ -325,9 +313,6 @@ class ViewerScene:
 
     def _put_optional(self, result: TrackingResult, estimate: TransformedEstimate) -> None:
         """What is computed and sent only if the user wants to see it."""
-        if self.options.ellipsoids:
-            for name, node in self._ellipsoids.items():
-                _put_mesh(node, self._ellipsoid(result, name))
         if self.options.points == "none":
             return
         least = 2 if self.options.points == "tumors" else 1
@@ -368,9 +353,8 @@ class ViewerScene:
         tumors = {n: m for n, m in estimate.meshes.items() if n in self._shells}
         motion = result.estimate.motion
         if self._margin_mm is None:
-            margin = result.estimate.report.margin
-            radii = {name: stated_radius(margin, name) for name in tumors}
-            return {n: rough_margin(tumors[n], radius.mm) for n, radius in radii.items() if radius}
+            known = tumors.keys() & result.bounds.keys()
+            return {n: rough_margin(tumors[n], result.bounds[n].error_bound95_mm) for n in known}
         if self._margins_ct is None or motion is None:
             return {name: rough_margin(mesh, self._margin_mm) for name, mesh in tumors.items()}
         return {
@@ -378,26 +362,6 @@ class ViewerScene:
             for name, margin in zip(self._shells, self._margins_ct, strict=True)
             if name in tumors
         }
-
-    @cached_property
-    def _ball(self) -> Mesh:
-        from trimesh.creation import icosphere
-
-        ball = icosphere(3)
-        return Mesh(ball.vertices, ball.faces)
-
-    def _ellipsoid(self, result: TrackingResult, name: str) -> Mesh:
-        """The 95 % ellipsoid of a tumor's centre by the fit's own covariance; published frame.
-        Nothing without a motion."""
-        assert result.estimate is not None
-        motion, part = result.estimate.motion, result.estimate.report.parts.get(name)
-        if self._at_rest is None or motion is None or part is None or part.center_axes is None:
-            return _NOTHING
-        at_rest = dict(zip(self._at_rest.names, self._at_rest.parts, strict=True))[name]
-        center_mm = motion.carry(at_rest.box_mm.mean(0, keepdims=True))
-        radii_mm = _ELLIPSOID * np.array(part.center_axes_std_mm)
-        points_mm = center_mm + (self._ball.vertices_mm * radii_mm) @ np.array(part.center_axes)
-        return self._ball.moved(transform_points(self._pose, points_mm))
 
 
 def _put_mesh(node: MeshHandle, mesh: Mesh) -> None:

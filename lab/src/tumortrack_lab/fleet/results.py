@@ -36,7 +36,7 @@ _COLUMNS = {
     "organ_ml": "organ ml", "good": "good", "poor": "poor", "refused": "refused",
     "middle_mm": "centre mm", "rigid_middle_mm": "best rigid mm",
     "rigid_fit_middle_mm": "rigid fit mm", "middle_worst_mm": "worst mm",
-    "largest_miss_mm": "largest miss mm", "holds_for": "holds for", "margin_95_mm": "95 % margin",
+    "largest_ratio": "worst over bound", "holds_for": "holds for", "bound_factor": "bounds times",
 }  # fmt: skip
 _STYLE = (  # beside that of an evaluation's page
     "main { max-width: none; } section { overflow-x: auto; } th, td { text-align: left; "
@@ -121,8 +121,6 @@ def patient_row(content: Mapping[str, Any], lines: Sequence[Mapping[str, Any]]) 
     verdicts = [row["verdict"] for row in rows]
     every = pd.DataFrame(lines).reindex(columns=[*_SCENE])
     good = every[every.verdict == "good"]
-    limit = margin["largest_miss_mm"]
-    missed = good.groupby("scene").outside_mm.max()
     row = {
         "doubts": "\n".join(check["doubts"]), "side": check["side"], "input": check["kind"],
         **{name: check[name] for name in ("organ_ml", "slice_mm", "spacing_mm", "half_turn_mm")},
@@ -131,9 +129,8 @@ def patient_row(content: Mapping[str, Any], lines: Sequence[Mapping[str, Any]]) 
         "middle_95_mm": good.middle_mm.quantile(0.95), "middle_worst_mm": good.middle_mm.max(),
         "target_mm": good.drop_duplicates("scene").target_mm.median(),
         "margin_states": margin["states"], "margin_answers": margin["answers"],
-        "largest_miss_mm": limit, "holds_for": margin["holds_for"],
-        "within_largest": (missed <= limit).mean() if limit is not None and len(good) else None,
-        "margin_reason": margin["reason"],
+        "largest_ratio": margin["largest_ratio"], "holds_for": margin["holds_for"],
+        "bound_factor": margin["bound_factor"], "margin_reason": margin["reason"],
     }  # fmt: skip
     for name in ("good", "poor", "refused"):
         row[name] = verdicts.count(name) / len(rows) if rows else 0.0
@@ -142,8 +139,6 @@ def patient_row(content: Mapping[str, Any], lines: Sequence[Mapping[str, Any]]) 
         row |= {f"{prefix}{name}": every[f"{prefix}{name}"].median() for prefix in _RIGID}
     for far in FAR_MM:
         row[f"over_{far:g}_mm"] = int(good[f"over_{far:g}_mm"].sum())
-    for percent in (90, 95):
-        row[f"margin_{percent}_mm"] = margin["margin_mm"].get(f"{percent / 100:g}")
     return row
 
 

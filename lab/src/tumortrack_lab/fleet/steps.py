@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, TumortrackError
@@ -24,15 +23,15 @@ from tumortrack.imaging.case import Case, load_case, save_case
 from tumortrack.imaging.options import PrepareOptions
 from tumortrack.report.pictures import qc_picture
 from tumortrack.simulate.scene_folder import read_scene
+from tumortrack.tracking.bound_factor import NAME, write_factor
 from tumortrack.tracking.fingerprint import fingerprint
-from tumortrack.tracking.margins import NAME, write_sealed
 from tumortrack.tracking.model_files import case_model, load_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.fleet import checks
 from tumortrack_lab.fleet.list import Patient, hashed
 from tumortrack_lab.fleet.pictures import thumbnail, worst_picture
 from tumortrack_lab.fleet.task import File, Task
-from tumortrack_lab.margins.calibration import list_states, margins_of, row_of
+from tumortrack_lab.margins.factor import Locating, found_factor, list_states
 from tumortrack_lab.margins.table import head_of, open_table
 from tumortrack_lab.real.judging import judge
 from tumortrack_lab.tets import lattice
@@ -42,8 +41,7 @@ from tumortrack_lab.world.scenes import World, WorldConfig, simplified
 # Those of the wider world but for cut organs, which are not located any more.
 FAMILIES = ("rest", "plate", "clamp", "twist", "pull", "tether", "roll")
 _TEST = len(FAMILIES) * 100_000  # number of the first state that is evaluated on
-CONFIDENCES = (0.9, 0.95)
-_VERSIONS = {"evaluate": 5, "margins": 3}  # of other steps: 2
+_VERSIONS = {"evaluate": 5, "margins": 4}  # of other steps: 3
 Inputs = Mapping[str, Path]
 Given = Mapping[str, Any]
 
@@ -62,7 +60,7 @@ def chain(patient: Patient) -> dict[str, Task]:
         name: str, work: Any, options: Given, inputs: Mapping[str, Task | File], memory_mb: int
     ) -> Task:
         kind = name.rstrip("0123456789-")
-        version = _VERSIONS.get(kind, 2)
+        version = _VERSIONS.get(kind, 3)
         steps[name] = Task(patient.name, kind, version, work, dict(options), inputs, memory_mb)
         return steps[name]
 
@@ -146,42 +144,32 @@ def states(inputs: Inputs, options: Given, out: Path) -> None:
 
 def margins(inputs: Inputs, options: Given, out: Path) -> None:
     """margins.jsonl, a line for each state, as `tumortrack margins` writes it; result.json; and
-    with enough states margins.json, which belongs into the model's folder.
+    with enough states bound_factor.json, which belongs into the model's folder.
 
-    result.json: ``states``; ``answers``, the good estimates; ``reason`` why no margin is stated
-    (empty: one is); ``margin_mm`` by confidence (medians over the answers); ``largest_miss_mm`` of
-    the answers; ``holds_for``, the chance that one more exchangeable answer misses by no more than
-    that: n / (n + 1).
+    result.json: ``states``; ``answers``, the good ones; ``bound_factor``, by which their bounds are
+    to be multiplied; or the ``reason`` why it is not known; ``largest_ratio`` of what an answer is
+    off to its bound; ``holds_for``, the chance that one more exchangeable answer has no larger one:
+    n / (n + 1).
     """
     model = inputs["case"] / Case.MODEL
     seed, digest = options["seed"], store.sha256_of(model / store.MANIFEST)
-    tracker, rows = Tracker(load_model(model)), []
-    groups = [folder for name, folder in inputs.items() if name.startswith("states_")]
-    listed = list_states([folder for folder in groups if _scenes(folder)], seed)
-    for state in sorted(listed, key=lambda state: state.folder.name):
-        row = row_of(tracker, read_scene(state.folder), state, seed)
-        rows.append(msgspec.structs.replace(row, scene=state.folder.name))
-    head = head_of(digest, seed)
-    with open_table(out / "margins.jsonl", head) as (_, add):
+    locating, rows = Locating(Tracker(load_model(model)), seed), []
+    states = list_states([folder for folder in _groups(inputs) if _scenes(folder)], seed)
+    for state in sorted(states, key=lambda state: state.name):
+        row = locating.row(read_scene(state), state)
+        rows.append(msgspec.structs.replace(row, scene=state.name))
+    with open_table(out / "margins.jsonl", head_of(digest, seed)) as (_, add):
         for row in rows:
             add(row)
-    good = [row for row in rows if not row.doubt]
-    misses = [row.score("tumor") for row in good if "tumor" in row.misses]
+    ratios = [row.ratio for row in rows if row.ratio is not None]
     result: dict[str, Any] = {
-        "states": len(rows), "answers": len(good), "reason": "", "margin_mm": {},
-        "largest_miss_mm": max(misses, default=None),
-        "holds_for": len(misses) / (len(misses) + 1),
+        "states": len(rows), "answers": len(ratios), "reason": "", "bound_factor": None,
+        "largest_ratio": max(ratios, default=None), "holds_for": len(ratios) / (len(ratios) + 1),
     }  # fmt: skip
     try:
-        table = store.sha256_of(out / "margins.jsonl")
-        stated = margins_of(rows, table, CONFIDENCES, seed=seed)
-        write_sealed(out / NAME, msgspec.structs.replace(stated, model_sha256=digest))
-        for shells in stated.shells:
-            at = [
-                shells.radii["tumor"].at(s, r.measured) for r in good for _, s in r.misses["tumor"]
-            ]
-            known = [mm for mm in at if mm is not None]
-            result["margin_mm"][f"{shells.confidence:g}"] = float(np.median(known))
+        found = found_factor(rows, digest, store.sha256_of(out / "margins.jsonl"), seed)
+        write_factor(out / NAME, found)
+        result["bound_factor"] = found.factor
     except InputError as error:
         result["reason"] = f"too few states: {error}"
     store.write_json(out / "result.json", result)

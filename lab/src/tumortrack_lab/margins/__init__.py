@@ -1,1 +1,1 @@
-"""Calibration of margins: scenes of known truth -> the ``ModelMargins`` that a model states."""
+"""Error bounds: learned from random kidneys, and their factor on a user's scenes."""

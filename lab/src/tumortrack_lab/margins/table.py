@@ -10,39 +10,20 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from msgspec import field
-
 from tumortrack.core import store
 from tumortrack.core.config import Config, from_builtins, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.tracking.fingerprint import fingerprint
-from tumortrack.tracking.margins import Kind, Radius
-
-Miss = tuple[float, float | None]  # outward miss or distance (mm), and s (mm)
 
 
 class Row(Config, frozen=True):
-    """One state, located. ``doubt``: why there is no good estimate; ``misses``: of every tumor, of
-    the organ's surface, and of the worst target."""
+    """One state, located. ``ratio``: of a good answer, the farthest that a vertex of its tumors is
+    off, over their bound; ``doubt``: why there is none."""
 
     scene: str
     sha256: str
-    label: tuple[str, str, str]
+    ratio: float | None = None
     doubt: str = ""
-    measured: dict[str, float] = field(default_factory=dict)
-    misses: dict[Kind, tuple[Miss, ...]] = field(default_factory=dict)
-
-    def score(self, kind: Kind, form: Radius | None = None) -> float:
-        """Largest miss, mm; with a ``form`` relative to the size that it gives."""
-        misses = self.misses[kind]
-        if form is None:
-            return max(miss for miss, _ in misses)
-        return max(miss / form.size_mm(s or 0.0, self.measured) for miss, s in misses)
-
-    def within(self, kind: Kind, radius: Radius) -> bool:
-        """Whether all misses are within their radii."""
-        radii = [(miss, radius.at(s, self.measured)) for miss, s in self.misses[kind]]
-        return all(at is not None and miss <= at for miss, at in radii)
 
 
 @contextmanager

@@ -157,8 +157,8 @@ def _lump(
 def measured(tracker: Tracker, scenes: list[Scene], condition: Condition) -> list[dict[str, Any]]:
     """A row a scene (JSON): ``quality`` of the answer (none: there is none) and ``check`` that it
     failed; ``off_mm``, the largest error of a tumor's centre, and ``rigid_mm``, the rigid fit's to
-    the same points (``report.rivals``); ``beyond``: whether a tumor lies farther off than its
-    ``miss_mm``; ``seconds`` from the image to the answer."""
+    the same points (``report.rivals``); ``beyond``: whether a tumor lies farther off than
+    its bound; ``seconds`` from the image to the answer."""
     return [_row(tracker, scene, condition, seed) for seed, scene in enumerate(scenes)]
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pandas as pd
+from scipy.stats import binomtest
 
 import tumortrack
 import tumortrack_lab.cut
@@ -27,7 +28,7 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, OccupancyCloud
 from tumortrack.registration.locator import QUERIES
 from tumortrack.simulate.scene_folder import Scene, read_scene
-from tumortrack.tracking.margins import NAME, read_margins
+from tumortrack.tracking.bound_factor import NAME, read_factor
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.cut import VOXEL_MM, cut
@@ -35,7 +36,6 @@ from tumortrack_lab.peers.base import Fit, estimate_of
 from tumortrack_lab.study.document import table_of
 from tumortrack_lab.study.methods import Method, StudyCase, code_sha256
 from tumortrack_lab.study.tables import NOTHING, ordered
-from tumortrack_lab.study.trust import share_words
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
 from tumortrack_lab.twin.apparatus import moved
 from tumortrack_resection.budget import ErrorBudget, plan_within, planned_budgets
@@ -106,10 +106,10 @@ PLANNERS = (
 
 
 def calibrated(folder: Path) -> Method:
-    """A model with its margins, judged by all that the camera saw, as `locate` does it. Raises
-    InputError: it has none."""
-    if read_margins(folder) is None:
-        raise InputError(f"{folder} has no margins; calibrate it first (tumortrack margins).")
+    """A model with its bounds' factor, judged by all that the camera saw, as `locate` does it.
+    Raises InputError: it has none."""
+    if read_factor(folder) is None:
+        raise InputError(f"{folder} was not calibrated: tumortrack margins CASE SCENES.")
     tracker = cache(lambda: Tracker(load_model(folder)))
     identity = {name: store.sha256_of(folder / name) for name in (store.MANIFEST, NAME)}
     return Method("calibrated", identity, lambda s, n: tracker().locate(s.cloud, n, 0, s.depth))
@@ -250,7 +250,7 @@ def _cut(plans: pd.DataFrame, planner: str) -> dict[str, Any]:
         "left worst ml": _text(made.left_ml.max(), digits=2),
         "margin kept median mm": _text(made.margin_mm.median()),
         "worst mm": _text(made.margin_mm.min()),
-        "as asked %": share_words((made.margin_mm >= least_mm).sum(), len(made)),
+        "as asked %": _share_words((made.margin_mm >= least_mm).sum(), len(made)),
         "cut into it": (made.margin_mm <= 0).sum(), "into another tumor": made.hurt.map(bool).sum(),
         "healthy tissue mean ml": _text(free.healthy_ml.mean()),
         "healthy tissue mean %": _text(100 * (free.healthy_ml / parenchyma_ml).mean(), 0),
@@ -266,3 +266,11 @@ def _text(value: float, digits: int = 1, down: bool = False, up: bool = False) -
         whole = round(value * 10**digits, 6)
         value = (math.floor(whole) if down else math.ceil(whole)) / 10**digits
     return f"{value + 0.0:.{digits}f}"
+
+
+def _share_words(hits: int, cases: int) -> str:
+    """A share in %, with Clopper and Pearson's interval of 95 %."""
+    if not cases:
+        return "-"
+    low, high = binomtest(hits, cases).proportion_ci(0.95, "exact")
+    return f"{100 * hits / cases:.1f} ({100 * low:.1f} to {100 * high:.1f})"

@@ -20,11 +20,16 @@ from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.real.judging import by_tumor, judge
 from tumortrack_lab.study.document import beside_rigid, spread_mm, table_of
-from tumortrack_lab.study.trust import BANDS, band_of
 
 _ERRORS = {"middle_mm": "off", "rigid_middle_mm": "rigid", "rigid_fit_middle_mm": "fit"}
 _ERRORS |= {"shape_middle_mm": "shape"}
+_HIDDEN = (0.0, 0.4)  # shares of the surface: bounds between the bands
+BANDS = ("nothing hidden", "up to 40 %", "over 40 %")
 _ROWS, _SAVE_EVERY = "measured.json", 20
+
+
+def band_of(hidden_share: float) -> str:
+    return BANDS[int(np.searchsorted(_HIDDEN, hidden_share))]
 
 
 def measure(model: Path, anatomy_ct: Anatomy, out: Path, names: Sequence[str]) -> None:
@@ -34,7 +39,7 @@ def measure(model: Path, anatomy_ct: Anatomy, out: Path, names: Sequence[str]) -
     about = {"model_sha256": store.sha256_of(model / store.MANIFEST), "fingerprint": fingerprint()}
     kept = store.read_json(path) if path.exists() else {}
     rows = kept["rows"] if all(kept.get(name) == value for name, value in about.items()) else {}
-    tracker = Tracker(load_model(model, "cpu", with_margins=False))
+    tracker = Tracker(load_model(model, "cpu"))
     todo = [name for name in names if name not in rows]
     for done, name in enumerate(todo, start=1):
         rows[name] = _judged(tracker, anatomy_ct, read_scene(out / name))

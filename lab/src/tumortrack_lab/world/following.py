@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 from jaxtyping import Float64
 
@@ -134,7 +133,6 @@ def judge(
             estimate = locate(Moment(film.looks(number), poses))
             about |= {"quality": estimate.quality, "reason": estimate.reason}
             motion, parts = estimate.motion, estimate.report.parts
-            about["margin"] = msgspec.to_builtins(estimate.report.margin)
         except NoEstimate as error:
             about |= {"quality": "none", "reason": str(error)}
         if motion is not None:
