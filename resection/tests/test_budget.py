@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 
 import numpy as np
 import pytest
@@ -16,16 +16,15 @@ from msgspec.structs import replace as with_terms
 
 from cut_objects import swept, to_axes
 from live_objects import small_estimate, small_update
-from plan_objects import RADIUS_MM, TUMOR_MM, Deviating, located, sphere
-from reports import reporting
+from plan_objects import RADIUS_MM, TUMOR_MM, located, sphere
+from reports import bounded, reporting
+from tumortrack.core.assessment import ErrorBound
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.halt import Halt
-from tumortrack.core.report import MarginReport, StatedMargin
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.values import TrackingResult
 from tumortrack_resection.budget import (
     HAND_EYE_MM,
-    LEAST_TRACKING_MM,
     TERMS,
     TOOL_MM,
     UNKNOWN_TRACKING_MM,
@@ -33,10 +32,8 @@ from tumortrack_resection.budget import (
     checked_against,
     foreseen_mm,
     kept_words,
-    plan_within,
     planned_budgets,
     tightest,
-    widened,
 )
 from tumortrack_resection.facets import Tools
 from tumortrack_resection.live_budget import LiveBudget
@@ -200,13 +197,16 @@ def test_there_is_a_budget_for_every_tumor_the_planned_one_s_first():
     least = foreseen_mm(plan, two(), Tools())
     assert (first.margin_mm, other.margin_mm) == (least["tumor_2"], least["tumor_1"])
     assert (other.hand_eye_mm, other.tool_mm, other.motion_mm) == (0.7, 0.4 + OFF_MM, 1.0)
-    deviating = replace(two(), std_mm={"tumor_1": np.full(9, 2.0), "tumor_2": np.full(9, 0.1)})
-    first, other = planned_budgets(plan, deviating)
-    assert (first.tracking_mm, other.tracking_mm) == (LEAST_TRACKING_MM, 6.0)
+    first, other = planned_budgets(plan, replace(two(), bounds_mm={"tumor_1": 6.5, "tumor_2": 0.3}))
+    assert (first.tracking_mm, other.tracking_mm) == (0.3, 6.5)
+    assert not {"tracking"} & {*first.assumed, *other.assumed}
+    first, other = planned_budgets(plan, replace(two(), bounds_mm={"tumor_2": 0.3}))
+    assert (first.tracking_mm, other.tracking_mm) == (0.3, UNKNOWN_TRACKING_MM)
+    assert ("tracking" in first.assumed, "tracking" in other.assumed) == (False, True)
 
 
 def test_the_papers_method_keeps_nothing_below_the_tumor():
-    (found,) = planned_budgets(planned("published"), located(std_mm=0.5, n=12_000))
+    (found,) = planned_budgets(planned("published"), seen())
     assert found.margin_mm < 0.5
 
 
@@ -216,14 +216,22 @@ def test_what_nobody_states_is_assumed_and_named():
     assert bare.tracking_mm == UNKNOWN_TRACKING_MM
     assert bare.hand_eye_mm == HAND_EYE_MM
     assert bare.tool_mm == TOOL_MM + OFF_MM
-    (known,) = planned_budgets(planned(), located(std_mm=2.0), 0.7, 0.4, moved_mm=1.0)
+    bound = replace(seen(), bounds_mm={"tumor_1": 4.53})
+    (known,) = planned_budgets(planned(), bound, 0.7, 0.4, moved_mm=1.0)
     assert known.assumed == ()
-    assert [*known.terms.values()] == pytest.approx([6.0, 0.7, 0.4 + OFF_MM, 1.0, 0.0])
-    (sure,) = planned_budgets(planned(), located(std_mm=0.1))
-    assert sure.tracking_mm == LEAST_TRACKING_MM  # none is as good as it says
-    rows = [line.split() for line in sure.table()]
+    assert [*known.terms.values()] == pytest.approx([4.53, 0.7, 0.4 + OFF_MM, 1.0, 0.0])
+    rows = [line.split() for line in planned_budgets(planned(), bound)[0].table()]
     assert ["hand-eye", "2.0", "assumed"] in rows
     assert [row[0] for row in rows[1:]] == [*TERMS, "together"]
+    assert rows[1] == ["tracking", "4.5", *ErrorBound(4.53).words.split()]
+    assert ["tracking", "8.0", "assumed"] in [line.split() for line in bare.table()]
+
+
+def test_the_bound_of_a_poor_estimate_is_assumed_to_hold():
+    poor = replace(seen(), bounds_mm={"tumor_1": 9.5}, doubt="it is seen through")
+    (found,) = planned_budgets(planned(), poor)
+    assert found.tracking_mm == 9.5
+    assert "tracking" in found.assumed
 
 
 def test_a_calibration_states_its_error_at_the_tumor(tmp_path):
@@ -244,8 +252,8 @@ def test_a_calibration_states_its_error_at_the_tumor(tmp_path):
             stated(**error)
 
 
-def update(number, latency_ms=100.0, smoothing_ms=0.0, std_mm=0.5):
-    estimate = replace(small_estimate(), motion=Deviating(std_mm))
+def update(number, latency_ms=100.0, smoothing_ms=0.0, **bounds_mm):
+    estimate = bounded(small_estimate(), **{"tumor_1": 4.2, "tumor_2": 4.2, **bounds_mm})
     estimate = reporting(estimate, smoothing={"lag_ms": smoothing_ms})
     stamp_ns = small_update().stamp_ns + number * 33_000_000
     return replace(small_update(), stamp_ns=stamp_ns, estimate=estimate, latency_ms=latency_ms)
@@ -289,14 +297,12 @@ def test_lag_is_the_tumors_speed_times_all_that_comes_late():
     assert live.now.lag_mm == 0
 
 
-def test_a_tumor_is_as_unsure_as_along_its_least_sure_axis():
-    live = Live(budget(20.0))
-    live.add_up(update(0, std_mm=2.0), 0.0)  # over all axes 1.2
-    assert live.now.tracking_mm == 6.0
-    estimate = update(0, std_mm=2.0).estimate
-    seen = of_estimate(estimate)
-    assert {*seen.std_mm} == {"tumor_1", "tumor_2"}
-    assert (seen.std_mm["tumor_1"] == 2.0).all()
+def test_a_tumor_is_as_far_off_as_its_estimate_says():
+    live = Live(budget(20.0, tracking_mm=3.0))
+    live.add_up(update(0, tumor_1=5.5), 0.0)
+    assert (live.now.tracking_mm, live.now.assumed) == (5.5, ())
+    estimate = update(0, tumor_1=5.5, kidney=7.0).estimate
+    assert of_estimate(estimate).bounds_mm == {"tumor_1": 5.5, "tumor_2": 4.2}
 
 
 def test_a_camera_whose_clock_is_ahead_takes_nothing_off_the_lag():
@@ -313,7 +319,7 @@ def test_a_new_plan_helps_where_the_motion_alone_is_too_much():
     values = {"sum_mm": pytest.approx(6.1), "margin_mm": 5.6, "part": "tumor_1", "term": "tracking"}
     assert said.values.items() >= values.items()
     assert helps
-    _, helps = live.add_up(update(2, std_mm=2.0), 1.9, 5.6)
+    _, helps = live.add_up(update(2, tumor_1=6.0), 1.9, 5.6)
     assert not helps
     # Accepted by a person when it was planned: added up, and nothing follows.
     accepted = Live(budget(1.0, motion_mm=2))
@@ -353,76 +359,20 @@ def test_the_worst_is_of_what_the_arms_moved_on():
     assert (summary["planned"]["margin_mm"], summary["planned"]["part"]) == (9.0, "tumor_1")
 
 
-def stating(**mm: float) -> Located:
-    """Located, by an estimate that states these margins with 90 and 95 %."""
-    less = {name: radius_mm - 1 for name, radius_mm in mm.items()}
-    said = (StatedMargin(confidence=0.9, mm=less), StatedMargin(confidence=0.95, mm=mm))
-    return replace(located(std_mm=0.2, n=12_000), margin=MarginReport(stated=said))
-
-
-def test_a_calibrated_margin_is_the_tracking_term():
-    seen = stating(tumor_1=4.5)
-    (highest,) = planned_budgets(planned(), seen)
-    assert (highest.tracking_mm, highest.confidence) == (4.5, 0.95)
-    assert ["tracking", "4.5", "95", "%", "margin"] in [line.split() for line in highest.table()]
-    (chosen,) = planned_budgets(planned(), seen, confidence=0.9)
-    assert (chosen.tracking_mm, chosen.confidence) == (3.5, 0.9)
-    (without,) = planned_budgets(planned(), located(std_mm=0.2, n=12_000))
-    assert (without.tracking_mm, without.confidence) == (LEAST_TRACKING_MM, 0)
-    for none in (located(std_mm=0.2, n=12_000), stating(tumor_2=3.0)):
-        with pytest.raises(InputError, match=r"95 % margin of tumor_1"):
-            planned_budgets(planned(), none, confidence=0.95)
-
-
-def test_another_tumor_without_a_margin_falls_back_on_its_deviation():
-    """Only the planned one must have what was asked for."""
-    both = replace(two(), margin=stating(tumor_1=4.5).margin)
-    both = replace(both, std_mm={name: np.full(9, 2.0) for name in ("tumor_1", "tumor_2")})
-    plan = plan_resection(both, ResectionConfig(tumor="tumor_1"))
-    first, other = planned_budgets(plan, both, confidence=0.95)
-    assert (first.tracking_mm, first.confidence) == (4.5, 0.95)
-    assert (other.tracking_mm, other.confidence) == (6.0, 0)
-
-
-def test_healthy_tissue_is_kept_beyond_all_errors():
-    seen, config = stating(tumor_1=2.0), ResectionConfig(margin_mm=3.0, most_healthy=1.0)
-    budgets_of = partial(
-        planned_budgets,
-        located=seen,
-        hand_eye_mm=0.5,
-        tool_error_mm=0.0,
-        moved_mm=1.0,
-        confidence=0.95,
-    )
-    plan_of = partial(plan_resection, seen)
-    as_asked, same, notes = plan_within(plan_of, config, budgets_of)
-    assert (as_asked.margin_mm, same, notes) == (3.0, config, ())
-    plan, wide, (note,) = plan_within(plan_of, config, budgets_of, beyond_errors=True)
-    assert wide.margin_mm == pytest.approx(3 + 1 + math.hypot(2.0, 0.5, OFF_MM))
-    assert plan.margin_mm == wide.margin_mm
-    (found,) = budgets_of(plan)
-    assert found.left_mm == pytest.approx(3.0, abs=0.3)
-    assert "3 mm of healthy tissue" in note
-    assert "within 2.0 mm of its estimate in 95 of 100" in note
-    (first,) = budgets_of(as_asked)
-    with pytest.raises(NoPlan, match=r"allowed are 20"):
-        widened(ResectionConfig(margin_mm=18.0), first)
-    for twice in (ResectionConfig(method="published"), ResectionConfig(sigmas=1.0)):
-        with pytest.raises(InputError, match="needs the method margin"):
-            widened(twice, first)
-
-
-def test_live_the_margin_of_the_moment_counts():
-    live = Live(budget(20.0, confidence=0.9))
-    of = update(0, std_mm=0.1)
-    said = stating(tumor_1=6.0).margin
-    of = replace(of, estimate=of.estimate.reporting(margin=said))
-    assert live.add_up(of, 0.0, 20.0) == (None, False)
-    assert (live.now.tracking_mm, live.now.confidence) == (5.0, 0.9)
-    of = replace(of, estimate=of.estimate.reporting(margin=MarginReport(reason="poor")))
-    why, _ = live.add_up(of, 0.0, 20.0)
-    assert (why.kind, why.values) == ("no_margin", {"percent": 90.0})
-    assert (live.now.tracking_mm, live.now.confidence) == (LEAST_TRACKING_MM, 0)
+@pytest.mark.parametrize("margin_mm", [20.0, 1.0], ids=["covered", "accepted"])
+def test_live_a_bound_that_is_lost_halts(margin_mm):
+    """Whatever a person accepted: less is known than when it was planned."""
+    live = Live(budget(20.0), budget(margin_mm, "tumor_2", motion_mm=2))
+    known = update(0)
+    unknown = replace(known, estimate=bounded(known.estimate, tumor_1=4.2))
+    assert live.add_up(known, 0.0, 20.0, others={"tumor_2": 0.0}) == (None, False)
+    why, helps = live.add_up(unknown, 0.0, 20.0, others={"tumor_2": 0.0})
+    assert (why.kind, why.values, helps) == ("no_bound", {"part": "tumor_2"}, False)
+    assert (live.now.part, live.now.tracking_mm) == ("tumor_2", UNKNOWN_TRACKING_MM)
+    # A plan that never had one goes on with what it assumed.
+    live = Live(budget(20.0, tracking_mm=8.0, assumed=("tracking",)))
+    assert live.add_up(replace(known, estimate=bounded(known.estimate)), 0.0, 20.0)[0] is None
+    assert live.now.tracking_mm == UNKNOWN_TRACKING_MM
 
 
 def test_the_margin_in_words_is_the_one_that_is_kept():

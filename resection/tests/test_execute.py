@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from clock import PATIENCE_S
 from live_objects import small_update
-from plan_objects import RADIUS_MM, TUMOR_MM, Deviating, located, sphere
+from plan_objects import RADIUS_MM, TUMOR_MM, located, sphere
+from reports import bounded
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.halt import CUT_NOTE, Halt
 from tumortrack.live.values import TrackingResult
@@ -490,25 +491,28 @@ def test_a_tumor_that_keeps_moving_is_waited_for_and_its_return_is_enough():
 INDEPENDENT_MM = np.hypot(4.2, np.sqrt(5))  # tracking, hand-eye and tool
 
 
-def budgeted(deviation_mm=0.5, **least_mm):
+def off_by(bound_mm):
+    """How an estimate differs whose tumors may be so far off."""
+    estimate = bounded(GOOD.estimate, tumor_1=bound_mm, tumor_2=bound_mm)
+    return {"estimate": estimate, "latency_ms": 50.0}
+
+
+def budgeted(**least_mm):
     """A world whose arms heed an error budget for each tumor, by the electrode's least distance
-    from it, and how unsure its estimates are."""
+    from it, and estimates as sure as when it was planned."""
     plan = keeping(plan_resection(LOCATED, ResectionConfig(tumor="tumor_1")), **least_mm)
-    unsure = Deviating(deviation_mm)
     planned = [
         ErrorBudget(part=part, margin_mm=mm, tracking_mm=4.2, hand_eye_mm=1.0, tool_mm=2.0)
         for part, mm in least_mm.items()
     ]
-    world = World(plan=plan, budget=LiveBudget(planned))
-    changes = {"estimate": replace(GOOD.estimate, motion=unsure), "latency_ms": 50.0}
-    return world, unsure, changes
+    return World(plan=plan, budget=LiveBudget(planned)), off_by(4.2)
 
 
 def test_arms_stand_while_the_errors_exceed_the_margin_and_go_on_when_they_shrink():
-    world, unsure, changes = budgeted(tumor_1=10.0, tumor_2=30.0)
+    world, changes = budgeted(tumor_1=10.0, tumor_2=30.0)
     cell = world.until("grasp", **changes)
     assert cell.left_mm == pytest.approx(10.0 - INDEPENDENT_MM)
-    unsure.deviation_mm = 4.0
+    changes = off_by(12.0)
     cell = world.frames(15, **changes)
     assert cell.halt.kind == "over_budget"
     assert cell.halt.values == {
@@ -518,7 +522,7 @@ def test_arms_stand_while_the_errors_exceed_the_margin_and_go_on_when_they_shrin
     assert cell.left_mm < 0
     assert world.frame(**changes).joints_rad == cell.joints_rad
     assert not world.plans  # a new plan would not help
-    unsure.deviation_mm = 1.5
+    changes = off_by(4.5)
     assert world.frames(2, **changes).halt is None
     world.until(DONE, **changes)
     budgets = world.operation.summary()["budget"]
@@ -529,7 +533,7 @@ def test_arms_stand_while_the_errors_exceed_the_margin_and_go_on_when_they_shrin
 
 
 def test_less_motion_than_allowed_can_be_too_much_and_is_planned_anew():
-    world, _, changes = budgeted(tumor_1=5.6, tumor_2=30.0)
+    world, changes = budgeted(tumor_1=5.6, tumor_2=30.0)
     world.until("approach", **changes)
     world.shift = np.array([1.5, 0.0, 0.0])  # 2 mm are allowed
     cell = world.frames(3, **changes)
@@ -545,7 +549,7 @@ def test_less_motion_than_allowed_can_be_too_much_and_is_planned_anew():
 
 def test_a_second_tumor_that_comes_nearer_to_the_electrode_halts_the_arms_as_well():
     """No farther than any other part may move: what counts is its own distance."""
-    world, _, changes = budgeted(tumor_1=30.0, tumor_2=8.0)
+    world, changes = budgeted(tumor_1=30.0, tumor_2=8.0)
     cell = world.until("sweep 1", **changes)
     assert cell.left_mm == pytest.approx(8.0 - INDEPENDENT_MM)
     world.shifts = {"tumor_2": np.array([0.0, 0.0, 3.8])}
@@ -561,16 +565,26 @@ def test_a_second_tumor_that_comes_nearer_to_the_electrode_halts_the_arms_as_wel
 
 
 def test_what_a_person_accepted_for_one_tumor_is_not_accepted_for_another():
-    world, unsure, changes = budgeted(tumor_1=10.0, tumor_2=2.0)
+    world, changes = budgeted(tumor_1=10.0, tumor_2=2.0)
     cell = world.until("grasp", **changes)
     assert cell.left_mm == pytest.approx(2.0 - INDEPENDENT_MM)  # it is told, and halts nothing
-    unsure.deviation_mm = 4.0
-    halt = world.frames(3, **changes).halt
+    halt = world.frames(3, **off_by(12.0)).halt
     assert (halt.kind, halt.values["part"]) == ("over_budget", "tumor_1")
-    world, unsure, changes = budgeted(tumor_1=4.0, tumor_2=2.0)
+    world, changes = budgeted(tumor_1=4.0, tumor_2=2.0)
     world.until("grasp", **changes)
-    unsure.deviation_mm = 9.0
-    assert world.frames(3, **changes).halt is None
+    assert world.frames(3, **off_by(27.0)).halt is None
+
+
+def test_arms_stand_while_nothing_says_how_far_off_a_tumor_may_be():
+    world, changes = budgeted(tumor_1=30.0, tumor_2=30.0)
+    world.until("sweep 1", **changes)
+    unknown = {**changes, "estimate": bounded(GOOD.estimate, tumor_1=4.2)}
+    cell = world.frames(15, **unknown)
+    assert (cell.halt.kind, cell.halt.values) == ("no_bound", {"part": "tumor_2"})
+    assert world.frame(**unknown).joints_rad == cell.joints_rad
+    assert not world.plans
+    assert world.frames(2, **changes).halt is None
+    world.until(DONE, **changes)
 
 
 def test_after_the_last_sweep_the_tumor_may_go():

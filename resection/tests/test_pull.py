@@ -348,8 +348,8 @@ def test_arms_that_stand_advise_touches_that_they_reach(pulled):
 
     update = replace(seen(), estimate=estimate)
     acting = operation(config)
-    assert acting.act(update, 0.0).estimate.report.next_evidence == ()  # at work
-    advice = acting.act(replace(update, quality="poor"), 0.02).estimate.report.next_evidence
+    assert acting.act(update, 0.0).estimate.assessment.next_evidence == ()  # at work
+    advice = acting.act(replace(update, quality="poor"), 0.02).estimate.assessment.next_evidence
     touches = [each for each in advice if each.kind == "touch"]
     assert len(touches) == 3
     reaches = ArmsReach(config, meshes["kidney"], home_rad)
@@ -357,7 +357,7 @@ def test_arms_that_stand_advise_touches_that_they_reach(pulled):
         place_mm = transform_points(table_from_camera, np.array([touch.place_mm]))[0]
         assert reaches(place_mm, table_from_camera[:3, :3] @ touch.direction)
     nowhere = operation(CellConfig(cutter_base=FAR, holder_base=FAR))
-    advice = nowhere.act(replace(update, quality="poor"), 0.0).estimate.report.next_evidence
+    advice = nowhere.act(replace(update, quality="poor"), 0.0).estimate.assessment.next_evidence
     assert {each.kind for each in advice} == {"outline", "look"}
 
 

@@ -22,7 +22,6 @@ def plan_resection(
     stand_mm: float | None = None,
     accept_poor: bool = False,
     accept_budget: bool = False,
-    confidence: float | None = None,
     **options: Any,
 ) -> ResectionPlan:
     """Where to cut a tumor out; nothing moves. `tumortrack plan` also plans the arms' motions.
@@ -35,10 +34,8 @@ def plan_resection(
         accept_poor: plan on a poor estimate; the plan's notes say so.
         accept_budget: plan though the margin does not cover the errors that are to be expected
             (docs/resection.md); the plan's notes say so.
-        confidence: the margin is of healthy tissue, beyond all errors, with the tumor's place as
-            sure as this, which the model's margins must state (docs/trust.md).
         options: fields of ``ResectionConfig``: ``tumor``, ``method`` (``margin`` or
-            ``published``), ``margin_mm``, ``sigmas`` and others.
+            ``published``), ``margin_mm`` and others.
 
     Returns:
         The plan: cuts, layers, grasp point; table frame, mm, z up.
@@ -54,7 +51,7 @@ def plan_resection(
         run = places.read_run(Path(located))
     stand_mm = places.STAND_MM if stand_mm is None else stand_mm
     frames = PublishedFrame("table", places.table_under(run.meshes, stand_mm))
-    cuts = plan_cuts(run, config, frames, accept_poor, confidence)
+    cuts = plan_cuts(run, config, frames, accept_poor)
     plan = checked_against(cuts.plan, cuts.budgets_of(cuts.plan), accept_budget)
     if picture is not None:
         from tumortrack_resection.pictures import draw_plan

@@ -7,18 +7,18 @@ hand-eye calibration and tool are bounds of independent errors: they add in quad
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import msgspec
 import numpy as np
 
+from tumortrack.core.assessment import ErrorBound
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.halt import Halt
 from tumortrack.core.mesh_query import contains, nearest_places
 from tumortrack.core.organ import is_tumor, organ_name
-from tumortrack.tracking.margins import StatedRadius, margin_words, stated_radius
 from tumortrack_resection.facets import TOOLS, Tools
 from tumortrack_resection.ur_sink import OFF_MM
 from tumortrack_resection.values import (
@@ -26,15 +26,12 @@ from tumortrack_resection.values import (
     OVER_BUDGET,
     UNCHECKED,
     Located,
-    ResectionConfig,
     ResectionPlan,
     name_of,
 )
 
-# So many standard deviations, but no less than the largest Hausdorff distance that version 0.1 had
-# for a tumor of five organs under finite-element loads. Not calibrated: see docs/resection.md.
-DEVIATIONS, LEAST_TRACKING_MM = 3.0, 4.2
-# Without standard deviations: the largest that the preset quick had there.
+# Where the method knows no bound: the largest Hausdorff distance that the preset quick of version
+# 0.1 had for a tumor of five organs under finite-element loads.
 UNKNOWN_TRACKING_MM = 8.0
 # Calibrations with 3D cameras err by about 0.9 mm and 0.27 degrees (arXiv 2311.01335): 1.9 mm at
 # 200 mm.
@@ -54,14 +51,13 @@ class ErrorBudget(Config, frozen=True, kw_only=True):
         part: the tumor's name.
         margin_mm: the least distance between the electrode, cutting or not, and the tumor's located
             surface; negative where it goes into the tumor.
-        tracking_mm: of the tumor's located surface.
+        tracking_mm: of the tumor's located surface: the estimate's bound (95 %).
         hand_eye_mm: of the camera's place in the arms' frame, at the tumor.
         tool_mm: of the tool's tip: the arm's accuracy, compliance, and its tolerated distance from
             its target.
         motion_mm: of the tumor since the plan; when planned, what is allowed for.
         lag_mm: how far the tumor moves before the arms act on an estimate.
         assumed: terms that were neither measured nor stated.
-        confidence: of the tracking term if it is a calibrated margin, else 0.
     """
 
     margin_mm: float
@@ -72,7 +68,6 @@ class ErrorBudget(Config, frozen=True, kw_only=True):
     motion_mm: float = 0.0
     lag_mm: float = 0.0
     assumed: tuple[str, ...] = ()
-    confidence: float = 0.0
 
     def __post_init__(self) -> None:
         for name, value in self.terms.items():
@@ -112,29 +107,21 @@ class ErrorBudget(Config, frozen=True, kw_only=True):
         """Lines for the screen."""
         lines = [f"errors that the electrode's distance to {self.part} has to cover, mm:"]
         for name, value in self.terms.items():
-            how = "  assumed" if name in self.assumed else ""
-            if name == "tracking" and not how:
-                sure = f"{100 * self.confidence:g} % margin"
-                how = f"  {sure if self.confidence else 'not calibrated'}"
-            lines.append(f"  {name:<9}{value:5.1f}{how}")
+            how = ErrorBound(value).words if name == "tracking" else ""
+            how = "assumed" if name in self.assumed else how
+            lines.append(f"  {name:<9}{value:5.1f}  {how}".rstrip())
         of = f"of {self.margin_mm:.1f}" if self.margin_mm > 0 else "of none: it is cut"
         lines.append(f"  {'together':<9}{self.sum_mm:5.1f}  {of}")
         return lines
 
-    def updated(
-        self, std_mm: np.ndarray | None, stated: StatedRadius | None = None, **terms: float
-    ) -> ErrorBudget:
-        """With new ``margin_mm``, ``motion_mm`` and ``lag_mm``, and the tracking error that an
-        estimate states of the tumor or, without one, its standard deviations."""
-        others = tuple(name for name in self.assumed if name != "tracking")
-        terms["confidence"] = stated.confidence if stated else 0.0
-        if stated is not None:
-            terms["tracking_mm"] = stated.mm
-        elif std_mm is None:
-            terms["tracking_mm"], others = UNKNOWN_TRACKING_MM, ("tracking", *others)
-        else:
-            terms["tracking_mm"] = max(DEVIATIONS * float(np.max(std_mm)), LEAST_TRACKING_MM)
-        return msgspec.structs.replace(self, assumed=others, **terms)
+    def updated(self, bound_mm: float | None, good: bool = True, **terms: float) -> ErrorBudget:
+        """With new ``margin_mm``, ``motion_mm`` and ``lag_mm``, and an estimate's bound of the
+        tumor's error, which holds only if the estimate is ``good``; else it is assumed."""
+        assumed = tuple(name for name in self.assumed if name != "tracking")
+        if bound_mm is None or not good:
+            assumed = ("tracking", *assumed)
+        terms["tracking_mm"] = UNKNOWN_TRACKING_MM if bound_mm is None else bound_mm
+        return msgspec.structs.replace(self, assumed=assumed, **terms)
 
 
 def planned_budgets(
@@ -143,19 +130,10 @@ def planned_budgets(
     hand_eye_mm: float | None = None,
     tool_error_mm: float | None = None,
     moved_mm: float = MOVED_MM,
-    confidence: float | None = None,
     tools: Tools = TOOLS,
 ) -> tuple[ErrorBudget, ...]:
     """Of each tumor, the planned one's first. ``hand_eye_mm`` and ``tool_error_mm`` are assumed if
-    not stated. Apart from ``moved_mm`` the organ lies still: there is no lag yet. A tumor's margin
-    is the one with this or else the highest ``confidence``. InputError: the planned one has none.
-    """
-    stated_mm = stated_radius(located.margin, plan.tumor, confidence)
-    if confidence is not None and stated_mm is None:
-        raise InputError(
-            f"the estimate states no {100 * confidence:g} % margin of {plan.tumor}: "
-            f"{margin_words(located.margin)}."
-        )
+    not stated. Apart from ``moved_mm`` the organ lies still: there is no lag yet."""
     stated = {"hand-eye": hand_eye_mm, "tool": tool_error_mm}
     least_mm = plan.least_mm or foreseen_mm(plan, located, tools)
     others = [name for name in map(name_of, located.tumors) if name != plan.tumor]
@@ -169,23 +147,8 @@ def planned_budgets(
             motion_mm=moved_mm,
             assumed=tuple(name for name, value in stated.items() if value is None),
         )
-        sure = stated_radius(located.margin, part, confidence)
-        budgets.append(budget.updated(located.std_mm.get(part), sure))
+        budgets.append(budget.updated(located.bounds_mm.get(part), good=not located.doubt))
     return tuple(budgets)
-
-
-def widened(config: ResectionConfig, budget: ErrorBudget) -> ResectionConfig:
-    """With all errors added to the margin of ``config``. Raises InputError: the method keeps no
-    margin below the tumor, or ``sigmas`` would count errors twice; NoPlan: it becomes too wide."""
-    if config.method != "margin" or config.sigmas > 0:
-        raise InputError("--confidence needs the method margin, and no --sigmas.")
-    wide_mm = config.margin_mm + budget.sum_mm
-    if wide_mm > MARGIN_MM[1]:
-        raise NoPlan(
-            f"{config.margin_mm:g} mm of healthy tissue and {budget.sum_mm:.1f} mm of error are "
-            f"{wide_mm:.1f} mm; allowed are {MARGIN_MM[1]:g}. Look from nearer, or uncover more."
-        )
-    return msgspec.structs.replace(config, margin_mm=wide_mm)
 
 
 def tightest(budgets: Sequence[ErrorBudget]) -> ErrorBudget:
@@ -214,28 +177,6 @@ def checked_against(
         unknown = "without the arms' motions nobody knows where the electrode goes"
         notes = [f"{UNCHECKED}: {unknown}.", *notes]
     return replace(plan, notes=(*plan.notes, *notes))
-
-
-def plan_within(
-    plan_of: Callable[[ResectionConfig], ResectionPlan],
-    config: ResectionConfig,
-    budgets_of: Callable[[ResectionPlan], tuple[ErrorBudget, ...]],
-    beyond_errors: bool = False,
-) -> tuple[ResectionPlan, ResectionConfig, tuple[str, ...]]:
-    """A plan, its configuration in the end, and notes on that. ``beyond_errors``: all errors are
-    added to the margin. Raises as ``widened``."""
-    plan = plan_of(config)
-    if not beyond_errors:
-        return plan, config, ()
-    healthy_mm, config = config.margin_mm, widened(config, budgets_of(plan)[0])
-    plan = plan_of(config)
-    budgets = budgets_of(plan)
-    note = (
-        f"the margin is {healthy_mm:g} mm of healthy tissue and {budgets[0].sum_mm:.1f} mm of "
-        f"error, with the tumor within {budgets[0].tracking_mm:.1f} mm of its estimate in "
-        f"{100 * budgets[0].confidence:g} of 100 such cases."
-    )
-    return plan, config, (note,)
 
 
 def foreseen_mm(plan: ResectionPlan, located: Located, tools: Tools) -> dict[str, float]:

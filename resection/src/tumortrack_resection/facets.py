@@ -16,7 +16,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from tumortrack.core.errors import NoPlan
 from tumortrack.core.types import ORGAN
 from tumortrack_resection.values import Located, ResectionConfig, name_of
 
@@ -82,8 +81,6 @@ class FacetSearch:
         targets: labels of the tumors that are to come away.
         keep_mm: what else the electrode keeps away from, with the distances of its surface, mm.
         like: outward normals (k, 3) of an earlier plan; None: they are searched for.
-
-    Raises NoPlan: the margin with its uncertainty is wider than allowed.
     """
 
     def __init__(
@@ -94,9 +91,10 @@ class FacetSearch:
         self._config, self._tools = config, tools
         self._like = None if like is None else np.asarray(like, float)
         self._normals = sphere(_NORMALS) if self._like is None else self._like
-        points, margins = self._grown()
+        points = np.concatenate([located.meshes[name_of(n)].vertices_mm for n in targets])
         kerf_mm = tools.radius_mm
-        self._offsets = (self._normals @ points.T + margins).max(1) + kerf_mm + SLACK_MM
+        room_mm = config.margin_mm + kerf_mm + SLACK_MM
+        self._offsets = (self._normals @ points.T).max(1) + room_mm
         healthy = located.of(ORGAN)
         healthy = healthy[:: 1 + len(healthy) // _POINTS].astype(float)
         beyond = self._normals @ healthy.T > self._offsets[:, None] + kerf_mm
@@ -144,28 +142,6 @@ class FacetSearch:
             off = self._normals @ points.T - offsets[:, None]
             rows.append(_Near(_packed(np.abs(off) < room), _packed(off < room + EDGE_MM), weight))
         return rows
-
-    def _grown(self) -> tuple[np.ndarray, np.ndarray]:
-        """Points on the tumors' surfaces, and the margins that they need."""
-        config, located = self._config, self._located
-        names = [name_of(n) for n in self._targets]
-        margins = [np.full(len(located.meshes[name].vertices_mm), config.margin_mm)
-                   for name in names]  # fmt: skip
-        if config.sigmas > 0:
-            if lacking := [name for name in names if name not in located.std_mm]:
-                raise NoPlan(
-                    f"the estimate does not say how unsure it is of {lacking[0]}, so that can't be "
-                    "added to the margin. Use a model of preset clinic, or sigmas 0."
-                )
-            margins = [m + config.sigmas * located.std_mm[n]
-                       for m, n in zip(margins, names, strict=True)]  # fmt: skip
-        if (widest := max(float(m.max()) for m in margins)) > config.most_margin_mm:
-            raise NoPlan(
-                f"the estimate is so unsure that the margin would be {widest:.1f} mm wide; allowed "
-                f"are {config.most_margin_mm:g} mm. Look from nearer, or uncover more of the organ."
-            )
-        points = np.concatenate([located.meshes[name].vertices_mm for name in names])
-        return points, np.concatenate(margins)
 
 
 class _Near(NamedTuple):

@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from tumortrack.core.evidence import Evidence, Held
 from tumortrack.core.geometry import Affine, transform_points
 from tumortrack.live.values import TrackingResult
-from tumortrack_resection.budget import DEVIATIONS, ErrorBudget
+from tumortrack_resection.budget import ErrorBudget
 from tumortrack_resection.motions import ARMS, HOLDER, Execution, Joints
 
 Place = Float64[np.ndarray, " 3"]
@@ -79,9 +79,9 @@ class Grip:
 
 
 def held_std_mm(budget: ErrorBudget) -> float:
-    """Of the holder's way since it gripped: the tool's bound counts as three standard deviations,
-    as that of tracking does. The hand-eye calibration's error is in both ends of the way alike."""
-    return budget.tool_mm / DEVIATIONS
+    """Of the holder's way since it gripped: the tool's bound counts as three standard deviations.
+    The hand-eye calibration's error is in both ends of the way alike."""
+    return budget.tool_mm / 3
 
 
 def _point_at(tip_mm: Place, result: TrackingResult) -> _Taken | None:

@@ -11,16 +11,13 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.config import to_builtins
-from tumortrack.core.estimate import Estimate
 from tumortrack.core.halt import Halt
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import TrackingResult
-from tumortrack.tracking.margins import stated_radius
 from tumortrack_resection.budget import ErrorBudget, tightest
 
 _SPEED_S = 0.3  # time over which a speed is averaged: estimates jitter from frame to frame
 _GAP_S = 0.5  # an older position does not count for the speed
-_EVERY = 8  # the deviation is evaluated at every so many vertices
 
 
 class LiveBudget:
@@ -28,7 +25,8 @@ class LiveBudget:
 
     Args:
         planned: the plan's, one a tumor. If a person accepted a distance that does not cover one,
-            that tumor's errors are reported only: they never halt the arms.
+            that tumor's errors are reported only: they never halt the arms, unless they become
+            unknown.
         servo_s: how far the arms lag behind their targets.
 
     Attributes:
@@ -67,34 +65,23 @@ class LiveBudget:
         late_ms += 0.0 if smoothing is None else smoothing.lag_ms
         speed_mm_s = self._speed_mm_s(update.stamp_ns, tumors[part][0])
         lag_mm = speed_mm_s * (late_ms / 1000 + self._servo_s)
+        bounds = estimate.assessment.bounds
         budgets = {
-            name: self._of(name, estimate, least_mm[name], motion_mm, lag_mm)
+            name: self._planned[name].updated(
+                bounds[name].error_bound95_mm if name in bounds else None,
+                margin_mm=least_mm[name], motion_mm=float(motion_mm), lag_mm=lag_mm,
+            )
             for name, (_, motion_mm) in tumors.items()
             if name in self._planned
-        }
+        }  # fmt: skip
         self.now = tightest(list(budgets.values()))
+        for name, now in budgets.items():
+            if "tracking" in now.assumed and "tracking" not in self._planned[name].assumed:
+                return Halt("no_bound", {"part": name}), False
         covered = {n: each for n, each in budgets.items() if self._planned[n].left_mm >= 0}
-        for name, now in covered.items():
-            if self._planned[name].confidence > now.confidence:
-                percent = 100 * self._planned[name].confidence
-                return Halt("no_margin", {"percent": percent}), False
         if not covered or (worst := tightest(list(covered.values()))).left_mm >= 0:
             return None, False
         return worst.as_halt, msgspec.structs.replace(worst, motion_mm=0.0).left_mm >= 0
-
-    def _of(
-        self, part: str, estimate: Estimate, least_mm: float, motion_mm: float, lag_mm: float
-    ) -> ErrorBudget:
-        """A tumor's, now."""
-        planned = self._planned[part]
-        stated = stated_radius(estimate.report.margin, part, planned.confidence or None)
-        std_mm, motion = None, estimate.motion
-        if stated is None and motion is not None:
-            places = motion.back(estimate.meshes[part].vertices_mm[::_EVERY])
-            std_mm = None if places is None else motion.largest_std_mm(places)
-        return planned.updated(
-            std_mm, stated, margin_mm=least_mm, motion_mm=float(motion_mm), lag_mm=lag_mm
-        )
 
     def went_on(self) -> None:
         """The arms may move on the last estimate."""

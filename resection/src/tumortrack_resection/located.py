@@ -9,8 +9,8 @@ from typing import Any
 import msgspec
 import numpy as np
 from jaxtyping import Float64
-from scipy.spatial import cKDTree
 
+from tumortrack.core.assessment import Assessment
 from tumortrack.core.config import findings_in
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.estimate import Estimate
@@ -18,7 +18,6 @@ from tumortrack.core.geometry import rigid
 from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.organ import KIDNEY, is_tumor, organ_first, organ_name
 from tumortrack.core.patient import NOBODY, Patient
-from tumortrack.core.report import MarginReport
 from tumortrack.core.store import MANIFEST, read_json
 from tumortrack.core.types import ORGAN, Mesh, OccupancyCloud
 from tumortrack.sense.ply import parse_ply_properties
@@ -38,26 +37,23 @@ def table_under(meshes: Mapping[str, Mesh], stand_mm: float) -> Float64[np.ndarr
     return rigid(np.diag([1.0, -1.0, -1.0]), np.array([-x, y, high[2] + stand_mm]))
 
 
-def of_estimate(estimate: Estimate, unsure: bool = True) -> Located:
-    """In the camera frame. ``unsure``: with standard deviations of the tumors' surfaces."""
-    deviations, motion = {}, estimate.motion if unsure else None
-    for name, mesh in estimate.meshes.items():
-        if motion is None or not is_tumor(name):
-            continue
-        places = motion.back(mesh.vertices_mm)
-        if places is not None and (std_mm := motion.largest_std_mm(places)) is not None:
-            deviations[name] = std_mm
+def of_estimate(estimate: Estimate) -> Located:
+    """In the camera frame."""
     return Located(
         estimate.cloud.points_mm,
         estimate.cloud.labels,
         estimate.meshes,
-        deviations,
+        _bounds_mm(estimate.assessment),
         stamp_ns=estimate.cloud.stamp_ns,
         patient=estimate.patient,
-        margin=estimate.report.margin,
         structures=estimate.structures,
-        doubt="" if estimate.quality == "good" else estimate.reason or "unknown",
+        doubt=estimate.reason,
     )
+
+
+def _bounds_mm(assessment: Assessment) -> dict[str, float]:
+    bounds = assessment.bounds.items()
+    return {name: bound.error_bound95_mm for name, bound in bounds if is_tumor(name)}
 
 
 def poor_estimate_notes(doubt: str, accept_poor: bool) -> tuple[str, ...]:
@@ -72,38 +68,32 @@ def poor_estimate_notes(doubt: str, accept_poor: bool) -> tuple[str, ...]:
     return (f"{POOR_ESTIMATE}: {doubt}.",)
 
 
-class _Quality(msgspec.Struct):
-    verdict: str
-    reason: str = ""
-
-
 class _Report(msgspec.Struct):
     """The part of a run's report.json that planning needs."""
 
-    quality: _Quality
+    assessment: Assessment
     patient: Patient = NOBODY
     stamp_ns: int = 0
     structures: tuple[str, ...] = ()
-    margin: MarginReport | None = None
     model: dict[str, Any] = {}
 
 
 def read_run(folder: Path) -> Located:
-    """A run's folder, camera frame; a surface's uncertainty is that of the nearest points. Raises
-    ArtifactError: no such run, damaged, or without its cloud."""
+    """A run's folder, camera frame. Raises ArtifactError: no such run, damaged, or without its
+    cloud."""
     stored, manifest = read_report(folder), read_json(folder / MANIFEST)
     path = folder / "occupancy.ply"
     try:
         report = msgspec.convert(stored, _Report)
+        doubt = report.assessment.reason
         weak = findings_in(report.model.get("warnings"), str(folder))
-        content = path.read_bytes()
-        table = parse_ply_properties(content, str(path), ("x", "y", "z", "label", "probability"))
-    except (OSError, InputError, msgspec.ValidationError) as error:
+        columns = ("x", "y", "z", "label", "probability")
+        table = parse_ply_properties(path.read_bytes(), str(path), columns)
+    except (OSError, InputError, KeyError, msgspec.ValidationError) as error:
         reason = str(error).rstrip(".")
         raise ArtifactError(
             f"{folder} is not a run that can be planned on: {reason}. Locate again."
         ) from error
-    doubt = "" if report.quality.verdict == "good" else report.quality.reason or "unknown"
     cloud = OccupancyCloud(table[:, :3], table[:, 3], table[:, 4])
     surfaces = {Path(file).stem for file in manifest["files"] if file.endswith(".ply")}
     surfaces = {name for name in surfaces if not name.endswith(MARGIN)}
@@ -120,25 +110,13 @@ def read_run(folder: Path) -> Located:
         raise ArtifactError(
             f"{folder} has points of {', '.join(lacking)} and no {lacking[0]}.ply; locate again."
         )
-    try:
-        std_mm = parse_ply_properties(content, str(path), ("largest_std_mm",))[:, 0]
-    except InputError:  # the method states none
-        deviations = {}
-    else:
-        nearest = cKDTree(cloud.points_mm)
-        deviations = {
-            name: std_mm[nearest.query(mesh.vertices_mm)[1]]
-            for name, mesh in meshes.items()
-            if is_tumor(name)
-        }
     return Located(
         cloud.points_mm,
         cloud.labels,
         meshes,
-        deviations,
+        _bounds_mm(report.assessment),
         stamp_ns=report.stamp_ns,
         patient=report.patient,
-        margin=report.margin,
         structures=structures,
         doubt=doubt,
         weak=weak,

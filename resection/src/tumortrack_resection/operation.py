@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
+from tumortrack.assessment.advice import advise
 from tumortrack.core.colours import CUT, ENERGISED, NOW, TO_CUT
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
@@ -27,7 +28,6 @@ from tumortrack.core.halt import CUT_NOTE, Halt
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import Polyline, RigidShape, TrackingResult, Workcell
 from tumortrack.registration.advice import Place, Reach
-from tumortrack.tracking.advice import advise
 from tumortrack_resection.budget import MOVED_MM
 from tumortrack_resection.grip import Grip
 from tumortrack_resection.live_budget import LiveBudget
@@ -200,10 +200,10 @@ class Operation:
         estimate, execution = update.estimate, self._execution
         if estimate is None or self._locate is None or self._reach is None:
             return estimate
-        if not estimate.report.next_evidence or self.planned.plan.tumor not in estimate.meshes:
+        if not estimate.assessment.next_evidence or self.planned.plan.tumor not in estimate.meshes:
             return estimate
         if execution.halted is None or execution.grips:
-            return estimate.reporting(next_evidence=())
+            return estimate.assessed(next_evidence=())
         table_from_camera = update.published_frame.published_from_camera
         organ = next(iter(self._locate(update).meshes.values()))
         reaches = self._reach(organ, execution.joints_rad)
@@ -213,7 +213,7 @@ class Operation:
             return reaches(there_mm, table_from_camera[:3, :3] @ normal)
 
         advice = advise(estimate, self.planned.plan.tumor, reach)
-        return estimate.reporting(next_evidence=advice)
+        return estimate.assessed(next_evidence=advice)
 
     def evidence(self, camera_from_published: Affine, stamp_ns: int) -> tuple[Evidence, ...]:
         """Where the holder has the tissue that it grips, in a frame of the camera."""

@@ -25,10 +25,6 @@ class PlanOptions(PatientOptions):
         tumor: which one (tumor_1, ...; default: the one that lies farthest out of the organ).
         margin: least distance between tumor and cut in mm (default 5, the paper's; ordinary
             estimates need more, docs/resection.md).
-        sigmas: add this many standard deviations of the estimate's own uncertainty to the margin
-            (default 0).
-        confidence: the margin is of healthy tissue, beyond all errors, with the tumor's place as
-            sure as this: 0.95, say (`tumortrack margins`; docs/trust.md).
         keep_away: STRUCTURE=MM, again for every structure: refuse a plan whose cuts come nearer
             to it.
         config: JSON file with these and all other choices of the planner (docs/resection.md).
@@ -47,8 +43,6 @@ class PlanOptions(PatientOptions):
     method: Literal["margin", "published"] | None = None
     tumor: str | None = None
     margin: float | None = None
-    sigmas: float | None = None
-    confidence: float | None = None
     keep_away: tuple[str, ...] = ()
     config: Path | None = None
     frame: Path | None = None
@@ -64,7 +58,7 @@ class PlanOptions(PatientOptions):
         from tumortrack_resection.values import ResectionConfig
 
         written = {} if self.config is None else store.read_json(self.config)
-        names = {"method": "method", "tumor": "tumor", "margin": "margin_mm", "sigmas": "sigmas"}
+        names = {"method": "method", "tumor": "tumor", "margin": "margin_mm"}
         options = {key: getattr(self, name) for name, key in names.items()}
         given = {key: value for key, value in options.items() if value is not None}
         if self.keep_away:

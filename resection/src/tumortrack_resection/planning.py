@@ -24,7 +24,6 @@ from tumortrack_resection.budget import (
     MOVED_MM,
     ErrorBudget,
     checked_against,
-    plan_within,
     planned_budgets,
 )
 from tumortrack_resection.drafts import Drafts
@@ -116,9 +115,9 @@ def begin_plan(run_folder: str | Path, **given: Any) -> Planning:
     """A plan of a run's folder, step by step, as `tumortrack plan` makes it.
 
     Args:
-        given: as on the command line: ``method``, ``tumor``, ``margin``, ``sigmas``,
-            ``confidence``, ``keep_away``, ``config``, ``frame``, ``stand``, ``cell``, ``arms``,
-            ``moved``, ``accept_poor``, ``accept_budget``, ``patient``, ``side``.
+        given: as on the command line: ``method``, ``tumor``, ``margin``, ``keep_away``, ``config``,
+            ``frame``, ``stand``, ``cell``, ``arms``, ``moved``, ``accept_poor``,
+            ``accept_budget``, ``patient``, ``side``.
 
     Raises:
         NoPlan: nothing to cut, or not as asked.
@@ -138,15 +137,12 @@ def begin_plan(run_folder: str | Path, **given: Any) -> Planning:
     run.patient.check_is(options.stated, str(run_folder))
     check_structures(run.structures)
     frames = _frames(run.meshes, options, cell.stand_mm)
-    cuts = plan_cuts(
-        run, config, frames, options.accept_poor, options.confidence,
-        cell=cell, moved_mm=options.moved,
-    )  # fmt: skip
+    cuts = plan_cuts(run, config, frames, options.accept_poor, cell, options.moved)
     model = store.read_json(run_folder / "report.json").get("model")
     has_bases = written.keys() >= {"cutter_base", "holder_base"}
     bases_source = store.sha256_of(options.cell) if options.cell and has_bases else INVENTED
     content = PlanFolder(
-        cuts.plan, cuts.config, frames, cuts.located.meshes,
+        cuts.plan, config, frames, cuts.located.meshes,
         structures=dict(cuts.located.structures), patient=run.patient,
         case_sha256=str(model.get("case_sha256") or "") if isinstance(model, dict) else "",
         frame_source=store.sha256_of(options.frame) if options.frame else INVENTED,
@@ -155,12 +151,11 @@ def begin_plan(run_folder: str | Path, **given: Any) -> Planning:
 
 
 class Cuts(NamedTuple):
-    """A plan without the arms; ``config``: in the end (see ``budget.plan_within``); ``drafts``: of
-    what it was taken; ``located``: the run in the plan's frame; ``budgets_of``: of this or another
-    plan of it; ``heading``: notes that come before any such plan's own."""
+    """A plan without the arms; ``drafts``: of what it was taken; ``located``: the run in the plan's
+    frame; ``budgets_of``: of this or another plan of it; ``heading``: notes that come before any
+    such plan's own."""
 
     plan: ResectionPlan
-    config: ResectionConfig
     drafts: Drafts
     located: Located
     budgets_of: Callable[[ResectionPlan], tuple[ErrorBudget, ...]]
@@ -172,14 +167,12 @@ def plan_cuts(
     config: ResectionConfig,
     frames: PublishedFrame,
     accept_poor: bool,
-    confidence: float | None,
-    *,
     cell: CellConfig | None = None,
     moved_mm: float = MOVED_MM,
 ) -> Cuts:
     """Where to cut a run, without the arms."""
     weak = (f"{WEAK_CASE}: {warning.words}." for warning in run.weak)
-    doubts = (*poor_estimate_notes(run.doubt, accept_poor), *weak)
+    heading = (*poor_estimate_notes(run.doubt, accept_poor), *weak)
     located = run.moved(frames.published_from_camera)
     cell = below(located.organ, cell or CellConfig())
 
@@ -188,20 +181,12 @@ def plan_cuts(
         tumor = located.meshes[plan.tumor].vertices_mm
         off_mm = tumor - frames.published_from_camera[:3, 3]
         error_mm = frames.error_at(float(np.linalg.norm(off_mm, axis=1).max()))
-        return planned_budgets(
-            plan, located, error_mm, cell.tool_error_mm, moved_mm, confidence, cell.tools
-        )  # fmt: skip
+        return planned_budgets(plan, located, error_mm, cell.tool_error_mm, moved_mm, cell.tools)
 
-    made: list[Drafts] = []
-
-    def plan_of(config: ResectionConfig) -> ResectionPlan:
-        made.append(Drafts(located, config, cell.tools))
-        return made[-1].best().plan()
-
-    plan, config, notes = plan_within(plan_of, config, budgets_of, confidence is not None)
-    heading = (*doubts, *notes)
+    drafts = Drafts(located, config, cell.tools)
+    plan = drafts.best().plan()
     plan = replace(plan, notes=(*heading, *plan.notes))
-    return Cuts(plan, config, made[-1], located, budgets_of, heading)
+    return Cuts(plan, drafts, located, budgets_of, heading)
 
 
 def check_arms_installed() -> None:

@@ -171,9 +171,9 @@ class ResectionSession:
             self.confirm()
         self._confirmed = False
 
-        def locate(result: TrackingResult, with_std: bool = False) -> Located:
+        def locate(result: TrackingResult) -> Located:
             assert result.estimate is not None
-            return of_estimate(result.estimate, with_std).moved(frames.published_from_camera)
+            return of_estimate(result.estimate).moved(frames.published_from_camera)
 
         config = msgspec.structs.replace(stored.config, tumor=stored.plan.tumor)
         # In a process of its own: planning takes a second, and must not delay a frame.
@@ -188,8 +188,7 @@ class ResectionSession:
                 result: TrackingResult, joints_rad: Joints, progress: ResectionProgress,
                 plan: ResectionPlan,
             ) -> Future[Planned]:  # fmt: skip
-                located = locate(result, with_std=stored.config.sigmas > 0)
-                return planner.submit(procedure.replan, located, joints_rad, progress, plan)
+                return planner.submit(procedure.replan, locate(result), joints_rad, progress, plan)
 
             # The worker ignores Ctrl-C, which the live loop handles.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -400,7 +399,9 @@ def _check_real(
         "a plan whose distances cover its errors (plan again with a wider margin)": (
             budget.left_mm >= 0
         ),
-        "a plan by a model that says how unsure it is (preset clinic)": ("tracking" not in assumed),
+        "a plan on an estimate that knows how far off its tumors may be (preset clinic, good)": (
+            "tracking" not in assumed
+        ),
         "a plan with the calibration's error (error_mm in the --frame file)": (
             "hand-eye" not in assumed
         ),

@@ -19,7 +19,7 @@ from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.organ import organ_name
 from tumortrack.core.patient import NOBODY, Patient
-from tumortrack.core.report import Finding, MarginReport
+from tumortrack.core.report import Finding
 from tumortrack.core.types import FIRST_TUMOR, Mesh
 
 Method = Literal["published", "margin"]
@@ -43,9 +43,7 @@ class ResectionConfig(Config, frozen=True, kw_only=True):
         method: published: the paper's two sweeps round the tumor's projection; margin: plane facets
             in which the electrode lies, so that its whole length keeps the margin.
         tumor: its part's name (tumor_1, ...); empty: the one that lies farthest out.
-        margin_mm: least distance between tumor and electrode (the paper's 5), to which ``sigmas``
-            standard deviations of the estimate's own uncertainty are added; with them it is
-            nowhere wider than ``most_margin_mm``.
+        margin_mm: least distance between tumor and electrode (the paper's 5).
         spacing_mm: between points of a stroke.
         lead_mm: strokes begin and end so far outside the organ.
         most_facets: of the piece; more follow the tumor more closely, and take longer.
@@ -58,21 +56,20 @@ class ResectionConfig(Config, frozen=True, kw_only=True):
     method: Method = "margin"
     tumor: str = ""
     margin_mm: float = 5.0
-    sigmas: float = 0.0
     spacing_mm: float = 1.0
     lead_mm: float = 5.0
     most_facets: int = 6
     least_exophytic: float = 0.05
     most_healthy: float = 0.5
-    most_margin_mm: float = 20.0
     keep_away: dict[str, float] = msgspec.field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.check_between("plan:", margin_mm=MARGIN_MM, most_margin_mm=(20, 60), sigmas=(0, 10))
-        self.check_between("plan:", spacing_mm=(0.2, 2), lead_mm=(0, 30), most_facets=(1, 12))
+        self.check_between("plan:", margin_mm=MARGIN_MM, spacing_mm=(0.2, 2), lead_mm=(0, 30))
+        self.check_between(
+            "plan:", most_facets=(1, 12), least_exophytic=(0, 1), most_healthy=(0, 1)
+        )
         if not all(0 < mm <= 50 for mm in self.keep_away.values()):
             raise InputError(f"plan: keep_away is {self.keep_away}; allowed: above 0 to 50 mm.")
-        self.check_between("plan:", least_exophytic=(0, 1), most_healthy=(0, 1))
 
 
 def name_of(label: int) -> str:
@@ -99,9 +96,7 @@ class Located:
     Attributes:
         points_mm, labels: the labelled cloud: label 1 organ without tumors, 2, 3, ... tumors.
         meshes: closed surfaces: the organ's name (tumors included), tumor_1, ...
-        std_mm: per tumor, the standard deviation of each of its mesh's vertices along the axis that
-            is least sure; left out where the estimate has none.
-        margin: the estimate's margins (``tracking.margins``).
+        bounds_mm: how far off a tumor is at most (95 %); left out where the estimate knows none.
         structures: further surfaces that move with the organ, closed or open.
         doubt: why the estimate is poor; empty: it is good.
         weak: what weakens the case.
@@ -110,10 +105,9 @@ class Located:
     points_mm: Float[np.ndarray, "n 3"]
     labels: UInt8[np.ndarray, " n"]
     meshes: dict[str, Mesh] = field(default_factory=dict)
-    std_mm: dict[str, Float64[np.ndarray, " v"]] = field(default_factory=dict)
+    bounds_mm: Mapping[str, float] = field(default_factory=dict)
     stamp_ns: int = 0
     patient: Patient = NOBODY
-    margin: MarginReport | None = None
     structures: Mapping[str, Mesh] = field(default_factory=dict)
     doubt: str = ""
     weak: tuple[Finding, ...] = ()

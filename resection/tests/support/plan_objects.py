@@ -36,7 +36,7 @@ def organ_with(*tumors: Mesh) -> Mesh:
     return united(sphere(MIDDLE_MM, HALF_MM), *tumors)
 
 
-def located(*tumors: Mesh, n: int = 40_000, seed: int = 0, std_mm: float | None = None) -> Located:
+def located(*tumors: Mesh, n: int = 40_000, seed: int = 0, **bounds_mm: float) -> Located:
     """As an estimate in the table's frame: points evenly in the organ, labelled."""
     if not tumors:
         tumors = (sphere(TUMOR_MM, RADIUS_MM),)
@@ -51,10 +51,7 @@ def located(*tumors: Mesh, n: int = 40_000, seed: int = 0, std_mm: float | None 
         labels[np.linalg.norm(points - middle, axis=1) < radius] = label
     inside = labels > 0
     named = {f"tumor_{k}": tumor for k, tumor in enumerate(tumors, start=1)}
-    deviations = {} if std_mm is None else {
-        name: np.full(len(mesh.vertices_mm), std_mm) for name, mesh in named.items()
-    }  # fmt: skip
-    return Located(points[inside], labels[inside], {"kidney": organ, **named}, deviations)
+    return Located(points[inside], labels[inside], {"kidney": organ, **named}, bounds_mm)
 
 
 def located_of(

@@ -11,7 +11,7 @@ from tumortrack.core.report import Finding
 from tumortrack.core.tables import read_table
 
 HaltKind = Literal[
-    "no_estimate", "poor", "missing", "moved", "over_budget", "no_margin", "planning", "silent",
+    "no_estimate", "poor", "missing", "moved", "over_budget", "no_bound", "planning", "silent",
     "no_plan", "defect", "interrupted", "aborted", "ended", "stopped", "slipped", "restless",
 ]  # fmt: skip
 _SENTENCES = read_table("tumortrack.core", "halts.toml", dict[HaltKind, str])
