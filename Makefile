@@ -18,7 +18,7 @@ define INSTALL
 endef
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian clients kernels demo test test-all quick pythons pytest test-hard check attack fuzz crash replay fingerprint figures bench soak wheel lock licences audit results real world sequences plans pull pulls misses evidence noise rehearsal population site pictures clean
+.PHONY: help setup debian clients kernels demo test test-all quick pythons pytest test-hard check attack fuzz crash replay fingerprint figures bench soak wheel lock licences audit results real world sequences plans pull pulls bounds evidence noise rehearsal population site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -146,8 +146,8 @@ plans: setup  ## the instrument's distances in plans of scenes and random kidney
 pulls: setup  ## whether tumors that the holder pulls are cut out (ARGS="OUT CASE ... --count 40": 15 s a scene)
 	$(BIN)/python lab/scripts/pulls.py $(ARGS)
 
-misses: setup  ## learns how far off tumors may be, from random kidneys (ARGS="OUT --write src/tumortrack/assessment/misses.json"; half an hour)
-	$(BIN)/python lab/scripts/misses.py $(ARGS)
+bounds: setup  ## learns how far off organs and tumors may be, from random organs (ARGS="OUT --write src/tumortrack/assessment/bounds.json"; an hour)
+	$(BIN)/python lab/scripts/bounds.py $(ARGS)
 
 evidence: setup  ## what touches, outlines, landmarks and held tumors bring, on random kidneys (ARGS="OUT --kidneys 4"; 10 minutes)
 	$(BIN)/python lab/scripts/evidence.py $(ARGS)

@@ -2,7 +2,7 @@
 
     make evidence ARGS='OUT --kidneys 4 --seed 1'     (about 10 minutes on two cores)
 
-Makes random kidneys, their models and scenes in OUT, as `make misses` does, draws evidence of each
+Makes random kidneys, their models and scenes in OUT, as `make bounds` does, draws evidence of each
 scene from its truth with the errors of tools, calibrations and hands, and locates it with and
 without. --twin: a folder with cases/NAME and scenes/NAME (`tumortrack twin`), measured beside them.
 Prints tables, or fills in a document's block. The same command goes on where it was stopped; after
@@ -34,7 +34,7 @@ from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.study import evidence, evidence_tables, scripts
 from tumortrack_lab.study.document import table_of
 from tumortrack_lab.study.methods import code_sha256
-from tumortrack_lab.world.made import scenes_of_kidney
+from tumortrack_lab.world.made import scenes_of
 
 _BLOCK = "evidence"
 # Of errors, in the document.
@@ -84,10 +84,7 @@ def main(options: Options) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     twins = () if options.twin is None else _twins(options.twin, options.out)
     with ProcessPoolExecutor(available_cores(), get_context("spawn")) as pool:
-        made = {
-            n: pool.submit(scenes_of_kidney, options.out / str(n), n, options.states)
-            for n in numbers
-        }
+        made = {n: pool.submit(scenes_of, options.out / str(n), n, options.states) for n in numbers}
         _wait(made, "made")
         cases = [options.out / str(n) / "case" for n in numbers]
         organs = [

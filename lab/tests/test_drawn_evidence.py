@@ -25,7 +25,7 @@ from tumortrack_lab.world.evidence import (
     met,
     mirrored,
 )
-from tumortrack_lab.world.made import scenes_of_kidney
+from tumortrack_lab.world.made import scenes_of
 
 
 @cache
@@ -182,7 +182,7 @@ def test_scenes_that_were_made_or_tried_are_not_made_again(tmp_path):
     for name in ("case", "scenes"):
         (tmp_path / name).mkdir()
     scene().write(tmp_path / "scenes" / "00002-rest-none")  # the two before had no equilibrium
-    assert [path.name for path in scenes_of_kidney(tmp_path, 1, 3)] == ["00002-rest-none"]
-    assert scenes_of_kidney(tmp_path, 1, 2) == []
+    assert [path.name for path in scenes_of(tmp_path, 1, 3)] == ["00002-rest-none"]
+    assert scenes_of(tmp_path, 1, 2) == []
     with pytest.raises(ArtifactError):  # there is no case to make the fourth from
-        scenes_of_kidney(tmp_path, 1, 4)
+        scenes_of(tmp_path, 1, 4)

@@ -11,7 +11,14 @@ import pytest
 
 from reports import reporting
 from tumortrack.assessment import bound, verdict
-from tumortrack.assessment.bound import POOR_MM, MissModel, bounds_of, figures, shipped
+from tumortrack.assessment.bound import (
+    POOR_MM,
+    BoundModel,
+    Quantile,
+    bounds_of,
+    figures,
+    shipped,
+)
 from tumortrack.core.assessment import ErrorBound
 from tumortrack.core.types import DepthError, Look, SensorCloud
 from tumortrack.models.report import estimate_of
@@ -39,25 +46,37 @@ def test_the_page_says_of_which_method_the_shipped_model_is_unless_it_is_of_this
     assert stated == (shipped().fingerprint != fingerprint())
 
 
-def test_what_is_shipped_cannot_reward_what_gets_worse(estimate):
-    model = shipped()
-    known = figures(estimate.report, "tumor_1")
-    assert set(model.weights) <= set(known)
-    assert min(model.weights.values()) >= 0
-    before = model.radius_mm(known)
+def of_radius(radius_mm):
+    every = Quantile(math.log(radius_mm), {})
+    return BoundModel(fingerprint(), every, every, {})
+
+
+@pytest.mark.parametrize("part", ["tumor_1", "kidney"])
+def test_what_is_shipped_cannot_reward_what_gets_worse(estimate, part):
+    model = shipped().organ if part == "kidney" else shipped().tumor
+    known = figures(estimate.report, part)
+    assert set(model.hinges) <= set(known)
+    assert min(weight for hinges in model.hinges.values() for _, weight in hinges) >= 0
+    before = model.bound_mm(known)
     assert before > 0
     for name in known:
-        assert model.radius_mm({**known, name: known[name] + 0.5}) >= before
+        assert model.bound_mm({**known, name: known[name] + 0.5}) >= before
+
+
+def test_a_figure_counts_from_its_knots_on():
+    model = Quantile(math.log(2.0), {"cost": ((0.5, 1.0), (1.5, 2.0))})
+    for cost, expected in ((0.0, 2.0), (1.0, 2 * math.exp(0.5)), (2.0, 2 * math.exp(1.5 + 1.0))):
+        assert model.bound_mm({"cost": cost}) == pytest.approx(expected)
 
 
 def test_an_answer_says_how_far_off_its_tumors_may_be(estimate):
     bounds, tumor = estimate.assessment.bounds, estimate.report.parts["tumor_1"]
-    assert [*bounds] == ["tumor_1"]
+    assert [*bounds] == ["kidney", "tumor_1"]
     assert bounds["tumor_1"].least_sure == tumor.center_axes[0]
     known = figures(estimate.report, "tumor_1")
     depth_mm = 1.96 * estimate.report.motion.depth_share * math.hypot(*tumor.center_mm)
     assert depth_mm > 1
-    bound_mm = math.hypot(shipped().radius_mm(known), depth_mm)
+    bound_mm = math.hypot(shipped().tumor.bound_mm(known), depth_mm)
     assert bounds["tumor_1"].error_bound95_mm == pytest.approx(bound_mm)
     nearest_mm = np.linalg.norm(visible().points_mm - tumor.center_mm, axis=1).min()
     assert tumor.nearest_mm == pytest.approx(nearest_mm, abs=1.0)  # of the points that are fitted
@@ -69,7 +88,7 @@ def test_a_miss_that_may_be_large_makes_an_answer_poor(slim_model, monkeypatch):
     cases = (POOR_MM - 0.1, 0.0, None), (POOR_MM + 0.1, 0.0, "miss"), (2.0, 10.0, "depths")
     for radius_mm, depth_mm, kind in cases:
         cloud = replace(visible(), depth_error=DepthError(depth_mm))
-        model = MissModel(fingerprint(), math.log(radius_mm), {}, {})
+        model = of_radius(radius_mm)
         monkeypatch.setattr(bound, "shipped", lambda model=model: model)
         found = tracker.locate(cloud, 16, 0).finding
         assert (None if found is None else found.kind) == kind
@@ -77,7 +96,7 @@ def test_a_miss_that_may_be_large_makes_an_answer_poor(slim_model, monkeypatch):
 
 def test_a_factor_multiplies_the_bound_and_so_decides(slim_model, monkeypatch):
     model = load_model(slim_model, "cpu")
-    plain = MissModel(fingerprint(), math.log(0.8 * POOR_MM), {}, {})
+    plain = of_radius(0.8 * POOR_MM)
     monkeypatch.setattr(bound, "shipped", lambda: plain)
     cloud = replace(visible(), depth_error=DepthError(0.0))
     for factor, kind in ((1.0, None), (1.24, None), (1.26, "miss")):

@@ -14,13 +14,15 @@ from tumortrack.registration.bend import (
     _grouped,
     _Groups,
     _means_of_groups,
+    _precision_of_forces,
     _with_compliance,
     bend,
 )
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import GaussNewton, prior_precision, refine
 from tumortrack.registration.kernels import POSE
-from tumortrack.registration.looks import Looks
+from tumortrack.registration.looks import Looks, Residuals
+from tumortrack.registration.model_error import covariance_mm2
 from tumortrack.registration.uncertainty import held_by_prior_mm
 from warp_objects import ANATOMY, nudged, placed, refined
 
@@ -53,21 +55,21 @@ def test_a_state_of_the_library_stays_as_it_is():
     fit = refined(seen(placed()), START, CONFIG)
     bent = bend(fit, CONFIG)
     assert bent.compliance_std_mm == 0.5
-    apart = np.linalg.norm(bent.motion.carry(VERTICES) - fit.motion.carry(VERTICES), axis=1)
-    assert apart.max() < 0.6
-    assert bent.cost <= fit.cost + 0.1
+    off = [np.linalg.norm(m.carry(VERTICES) - PLACES, axis=1) for m in (fit.motion, bent.motion)]
+    assert off[1].mean() < off[0].mean()
+    assert off[1].max() < off[0].max()
 
 
 def test_forces_anywhere_are_followed_where_they_are_seen():
-    left_mm = []
+    left_mm, stds_mm = [], []
     for seed in range(6):
         fit = refined(seen(pressed(seed)), START, CONFIG)
         bent = bend(fit, CONFIG)
-        assert bent.compliance_std_mm > 0.5
-        assert bent.cost < fit.cost
+        stds_mm.append(bent.compliance_std_mm)
         left_mm.append([np.abs(each.distances_mm).mean() for each in (fit, bent)])
     of_library, of_bent = np.mean(left_mm, axis=0)
     assert of_bent < 0.7 * of_library
+    assert sum(std_mm > 0.5 for std_mm in stds_mm) >= 5  # or by states that spread farther
 
 
 def test_how_far_the_prior_holds_a_part_is_how_far_it_moves_without_some_of_it():
@@ -83,11 +85,32 @@ def test_how_far_the_prior_holds_a_part_is_how_far_it_moves_without_some_of_it()
     held_mm = held_by_prior_mm(fit.motion, slope)
     assert min(held_mm) > 0.1
     np.testing.assert_allclose(held_mm, np.linalg.norm(away_mm, axis=1) / less, rtol=0.4)
-    bent = bend(fit, CONFIG)
-    slopes = np.split(bent.prior_slope, [len(slope)])
-    np.testing.assert_allclose(slopes[0], slope, atol=0.2 * np.abs(slope).max())
-    forces = bent.motion.coefficients[len(fit.motion.coefficients) :]
-    np.testing.assert_allclose(slopes[1], forces / bent.compliance_std_mm**2)
+
+
+def test_what_points_tell_is_as_they_say_and_what_they_do_not_is_wide():
+    known, seen_by, count = 3, np.diag([30.0, 10.0, 0.0]), 3
+    rows = np.concatenate([np.ones((3, known)), seen_by], axis=1)
+    near = Residuals(np.zeros(3), rows, np.zeros((3, 0)), np.ones(3))
+    precision = _precision_of_forces(near, known, 0.5)
+    variances = 1 / np.linalg.eigvalsh(precision)
+    assert precision.shape == (count, count)
+    np.testing.assert_allclose(np.sort(variances), np.sort([
+        (900 * 0.25 + 4) / 901, (100 * 0.25 + 4) / 101, 4.0
+    ]))  # fmt: skip
+    strong = _precision_of_forces(near, known, 6.0)
+    np.testing.assert_allclose(np.linalg.inv(strong), 36 * np.eye(3), atol=1e-9)
+
+
+def test_an_organ_near_the_mean_has_a_narrow_prior_and_one_far_off_a_wide_one():
+    spreads = []
+    for share in (0.0, 1.0, 2.5):
+        fit = refined(seen(placed(share=share)), START, CONFIG)
+        start = _with_compliance(fit.motion)
+        at = fit.looks.residuals(start, CONFIG)
+        spreads.append(_Groups.near(fit, start, at, CONFIG, None, 0.4).likeliest()[1])
+    assert spreads[0] < 0.9
+    assert spreads == sorted(spreads)
+    assert spreads[2] > 1.2
 
 
 def test_what_is_not_seen_is_less_sure():
@@ -102,17 +125,21 @@ def test_what_is_not_seen_is_less_sure():
 def test_the_evidence_is_that_of_all_unknowns(std_mm, monkeypatch):
     monkeypatch.setattr(module, "_LINEAR_STEPS", 40)  # until the weights stay
     fit = refined(seen(pressed(0)), START, CONFIG)
-    start = _with_compliance(fit.motion)
-    some_mm = fit.looks.points_mm[:: module._EVERY]
-    rows, counts = _means_of_groups(start.residual_rows(some_mm), start.back(some_mm))
-    slopes, distances_mm = rows[:, :-1], rows[:, -1]
+    start, scale = _with_compliance(fit.motion), 0.7
+    near, points_ct = fit.looks.residuals(start, CONFIG), start.back(fit.looks.points_mm)
+    rows = np.column_stack([near.by_motion, near.distances_mm]).astype(np.float32)
+    rows, counts, middles_ct = _means_of_groups(rows, points_ct)
+    motion, field = rows[:, :-1], np.eye(len(rows))  # what neighbours share: an unknown a group
+    slopes, distances_mm = np.concatenate([motion, field], axis=1), rows[:, -1]
     precision = np.zeros((slopes.shape[1],) * 2)
-    known = POSE + len(fit.motion.coefficients)
+    known, count = POSE + len(fit.motion.coefficients), motion.shape[1]
     precision[:known, :known] = prior_precision(fit.motion.shape, CONFIG)
-    precision[known:, known:] = np.eye(len(precision) - known) / std_mm**2
+    precision[known:count, known:count] = np.eye(count - known) / std_mm**2
+    shared = scale**2 * covariance_mm2(middles_ct) + 1e-9 * field
+    precision[count:, count:] = np.linalg.inv(shared)
     off = np.zeros(len(precision))
     off[:known] = np.append(fit.moved, fit.motion.coefficients - fit.motion.shape.body.mean)
-    weight = module._EVERY * fit.looks.weight(CONFIG) * counts
+    weight = fit.looks.weight(CONFIG) * counts
     change = np.zeros(len(precision))
     for _ in range(40):  # Gauss-Newton steps of all unknowns
         residuals_mm = distances_mm + slopes @ change
@@ -123,9 +150,32 @@ def test_the_evidence_is_that_of_all_unknowns(std_mm, monkeypatch):
     squares = (distances_mm + slopes @ change) ** 2
     expected = weight @ (squares / (1 + squares / 4))
     expected += (off + change) @ precision @ (off + change)
-    expected += 0.3 * (np.linalg.slogdet(curvature)[1] - np.linalg.slogdet(precision)[1])
-    cost = _Groups.near(fit, start, CONFIG, None).cost(std_mm)
-    assert cost == pytest.approx(expected, rel=1e-4)
+    expected += np.linalg.slogdet(curvature)[1] - np.linalg.slogdet(precision)[1]
+    cost = _Groups.near(fit, start, near, CONFIG, None, scale).cost(std_mm)
+    assert cost == pytest.approx(expected, rel=1e-3)
+
+
+def test_what_neighbours_share_is_marginalised():
+    """As if it were unknown."""
+    fit = refined(seen(pressed(1)), START, CONFIG)
+    start = _with_compliance(fit.motion)
+    near, error = fit.looks.residuals(start, CONFIG), start.shape.model_error
+    node, count = error.nearest(start.back(fit.looks.points_mm)), len(error.nodes_ct)
+    rows = np.concatenate([near.by_motion, np.eye(count)[node]], axis=1)
+    whole = rows.T @ (rows * near.weights[:, None])
+    whole[-count:, -count:] += error.precision / 0.7**2
+    slope, own = rows.T @ (near.weights * near.distances_mm), len(whole) - count
+    curvature, gradient = whole[:own, :own].copy(), slope[:own].copy()
+    weighted_mm = near.weights * near.distances_mm
+    error.marginalise(
+        curvature, gradient, node, near.by_motion, weighted_mm, near.weights, scale=0.7
+    )
+    ridge = np.eye(len(whole))
+    ridge[own:, own:] = 0
+    step = np.linalg.solve(whole + ridge, slope)[:own]
+    np.testing.assert_allclose(
+        np.linalg.solve(curvature + np.eye(own), gradient), step, rtol=1e-6, atol=1e-9
+    )
 
 
 def test_rivals_and_looks_stay():

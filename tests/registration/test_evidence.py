@@ -160,19 +160,6 @@ def test_landmarks_tell_which_way_round_an_organ_lies():
     assert turned.looks.evidence is not None
 
 
-def test_what_cameras_errors_cost_stays_when_a_touch_is_left_out():
-    shifted = SEEN + [2.0, 0, 0]  # by a camera that is 2 mm off
-    away = tuple(np.array(at(BEHIND[0])) + [0, 0, 25.0])
-    costs = []
-    for evidence in ([], [Touch(place_mm=away)]):
-        known = EvidenceTerms.of([*this_way_round(), *evidence], NAMES)
-        looks = Looks.of([SEEN, shifted], [np.eye(4)], known)
-        kept, _ = method().bend(method().register(looks))
-        assert kept.looks.cost > 0.5
-        costs.append(kept.points_cost)
-    assert costs[1] == pytest.approx(costs[0], abs=0.2)
-
-
 @pytest.mark.parametrize(
     ("agree", "wrong", "decides"), [(4, 1, True), (8, 1, False), (9, 2, True), (10, 2, False)]
 )
@@ -196,7 +183,7 @@ def test_what_contradicts_the_rest_is_left_out_and_named(slim_model):
     told = found.report.evidence
     assert [each.left_out for each in told] == [False] * 4 + [True]
     assert told[4].off_mm == pytest.approx(25, abs=3)
-    assert told[4].news == 0
+    assert told[4].news == pytest.approx(0, abs=1e-9)
     assert told[4].places_mm == (away,)
     assert all(0 < each.news <= 1 for each in told[:4])
     assert found.finding.kind == "evidence"
@@ -355,7 +342,7 @@ def test_what_is_not_allowed_is_said(make, words):
 
 
 def test_the_touches_that_would_tell_most_tell_as_much_as_they_say():
-    _, bent = method().bend(fitted([]))
+    bent = method().bend(fitted([]))
     motion = replace(bent.motion, rivals=())
     planned = Advisor(motion, 1).touches()
     stds_mm = [planned[0].std_mm, *(each.then_std_mm for each in planned)]

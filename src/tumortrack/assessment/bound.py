@@ -1,9 +1,9 @@
-"""How far off a tumor's centre may be, learned from kidneys whose truth is known.
+"""How far off a part may be, learned from organs whose truth is known.
 
-The logarithm of the radius within which 95 % of the misses lie is a sum of an answer's figures,
-with weights of 0 or more: no figure that gets worse makes an answer look better. Kidneys, tumors,
-physics and camera are simulated (``lab/scripts/misses.py``); none is a patient's. Source of
-quantiles of scaled residuals: Papadopoulos et al. 2011 (doi 10.1613/jair.3198).
+The logarithm of the bound is a sum of hinges of an answer's figures, with weights of 0 or more: no
+figure that gets worse makes an answer look better. They are the 95 % quantile of the largest miss
+of a part's points, fitted as such (pinball loss; Koenker and Bassett 1978, doi 10.2307/1913643), on
+simulated organs, physics, cameras and evidence (``lab/scripts/bounds.py``); none is a patient's.
 """
 
 from __future__ import annotations
@@ -18,38 +18,50 @@ from tumortrack.core.assessment import ErrorBound
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.report import FitReport
 
-_NAME = "misses.json"
-# An answer is poor from this radius on. docs/trust.md has what that is worth for kidneys and
-# families of physics left out.
+_NAME = "bounds.json"
+# An answer is poor from this bound on. docs/trust.md has what that is worth for organs, families
+# of physics and kinds of evidence left out.
 POOR_MM = 6.0
 _MOST_STRAYS, _FARTHEST_RIVAL_MM = 0.3, 10.0  # more say no more
 _LEAST_HELD_MM = 0.05  # nor does less
 _WITHIN = 1.96  # standard deviations: 95 % of a normal distribution
+Hinges = dict[str, tuple[tuple[float, float], ...]]
 
 
-class MissModel(Config, frozen=True):
-    """``constant``: logarithm of the radius, mm, if all figures are 0; ``fingerprint``: of the
-    method that it was learned with; ``about``: on what."""
+class Quantile(Config, frozen=True):
+    """Of the largest miss. ``constant``: logarithm of the bound, mm, where all figures are small;
+    ``hinges``: by figure, from which value on it counts, and by how much."""
+
+    constant: float
+    hinges: Hinges
+
+    def bound_mm(self, figures: dict[str, float]) -> float:
+        more = (
+            weight * max(figures[name] - knot, 0.0)
+            for name, hinges in self.hinges.items()
+            for knot, weight in hinges
+        )
+        return math.exp(self.constant + sum(more))
+
+
+class BoundModel(Config, frozen=True):
+    """``fingerprint``: of the method that it was learned with; ``about``: on what."""
 
     fingerprint: str
-    constant: float
-    weights: dict[str, float]
+    tumor: Quantile
+    organ: Quantile
     about: dict[str, Any]
-
-    def radius_mm(self, figures: dict[str, float]) -> float:
-        """Of the misses' 95 %."""
-        return math.exp(self.constant + sum(w * figures[name] for name, w in self.weights.items()))
 
 
 @cache
-def shipped() -> MissModel:
+def shipped() -> BoundModel:
     """What comes with this version."""
     text = files("tumortrack.assessment").joinpath(_NAME).read_text()
-    return from_builtins(json.loads(text), MissModel, _NAME)
+    return from_builtins(json.loads(text), BoundModel, _NAME)
 
 
 def figures(report: FitReport, name: str) -> dict[str, float] | None:
-    """Of a tumor; larger is worse. None: the method does not know them."""
+    """Of a part; larger is worse. None: the method does not know them."""
     part, cost, motion = report.parts[name], report.fit_cost, report.motion
     if cost is None or motion is None or part.fit_std_mm is None:
         return None
@@ -65,6 +77,7 @@ def figures(report: FitReport, name: str) -> dict[str, float] | None:
         "strays": min(cost.strays, _MOST_STRAYS),
         "rarity": math.log1p(motion.rarity),
         "compliance": math.log(motion.compliance_std_mm or 1.0),
+        "misfit": math.log(max(motion.misfit_mm, _LEAST_HELD_MM)),
         "rival": min(apart_mm, _FARTHEST_RIVAL_MM),
         "size": math.log1p(max(report.size.gain, 0.0)) if report.size is not None else 0.0,
         "unseen": report.unseen or 0.0,
@@ -80,11 +93,12 @@ def depths_within_mm(report: FitReport, name: str) -> float:
 
 
 def bounds_of(report: FitReport) -> dict[str, ErrorBound]:
-    """Of each tumor, where the method knows enough: what was learned, and what the camera's depths
+    """Of each part, where the method knows enough: what was learned, and what the camera's depths
     err by beside that."""
     bounds = {}
-    for name, part in report.tumors.items():
+    for name, part in report.parts.items():
+        quantile = shipped().tumor if name in report.tumors else shipped().organ
         if (known := figures(report, name)) is not None:
-            bound_mm = math.hypot(shipped().radius_mm(known), depths_within_mm(report, name))
+            bound_mm = math.hypot(quantile.bound_mm(known), depths_within_mm(report, name))
             bounds[name] = ErrorBound(bound_mm, part.center_axes and part.center_axes[0])
     return bounds

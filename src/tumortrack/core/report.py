@@ -101,7 +101,7 @@ class PartReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     """One part, camera frame. ``points``: of the labelled cloud, with their mean ``probability``;
     ``center_axes``: unit vectors along which the centre has the deviations
     ``center_axes_std_mm``, the least sure first; ``nearest_mm``: from the centre to the nearest
-    point that was seen; ``held_by_prior_mm``: how far the elastic prior, against the points, holds
+    point that was seen or known; ``held_by_prior_mm``: how far the elastic prior, against the points, holds
     the centre; ``fit_std_mm``: the largest deviations of centre and surface without the camera's
     common error. None: not found, or the method does not know."""
 
@@ -232,6 +232,7 @@ class AllowedPoses(_Value, frozen=True, kw_only=True):
 class MotionReport(_Value, frozen=True, kw_only=True):
     """The fitted motion: pose, elastic ``coefficients``, Gauss-Newton ``steps``. ``rarity``: of the
     library's state; ``compliance_std_mm``: of the compliance, whose coefficients are the last;
+    ``misfit_mm``: what the library leaves of groups of neighbouring points, root mean square;
     ``depth_share``: standard deviation of the camera's depths, all alike, as a share of them."""
 
     camera_from_ct: tuple[tuple[float, float, float, float], ...]
@@ -239,6 +240,7 @@ class MotionReport(_Value, frozen=True, kw_only=True):
     rarity: float
     steps: int
     compliance_std_mm: float | None
+    misfit_mm: float = 0.1
     depth_share: float = 0.0  # not stated by runs of before
 
 

@@ -1,12 +1,14 @@
 """The fit goes on in the body's compliance: what no state of the library can follow.
 
 Forces anywhere on the surface displace it (``simulate.elastic.modes.compliance_modes``), by
-independent coefficients of one standard deviation. Each frame chooses it by marginal likelihood
-(Laplace's approximation), so that an organ that is as the library has it stays so.
+independent coefficients of one standard deviation. Each frame chooses it, and how far states
+spread, by marginal likelihood (Laplace's approximation), so that an organ that is as the library
+has it stays so.
 
 The choice is made on groups of neighbouring points, whose distances are taken to be linear in the
-unknowns. Then follows a true step. The curvature there is the precision of the answer: far from
-what is seen the compliance says by how much the organ may be elsewhere.
+unknowns. Then follow true steps, in which evidence is true or false (a mixture). Neighbours share
+errors of the model (``model_error``). The curvature is the precision of the answer: far from what
+is seen the compliance says by how much the organ may be elsewhere.
 """
 
 from __future__ import annotations
@@ -21,36 +23,43 @@ from scipy.linalg import cho_factor, cho_solve
 from tumortrack.core.mesh_kernels import farthest
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.evidence import Terms
-from tumortrack.registration.gauss_newton import GaussNewton, RegistrationResult, prior_precision
+from tumortrack.registration.gauss_newton import RegistrationResult, prior_precision
 from tumortrack.registration.kernels import POSE
-from tumortrack.registration.looks import Looks
+from tumortrack.registration.looks import Looks, Residuals
+from tumortrack.registration.model_error import covariance_mm2
 from tumortrack.registration.motion import ElasticMotion
+from tumortrack.sense.noise import CAMERA_STD
 
 # Of the coefficients: hardly any; as loads like the library's would have them; strong ones. Five
 # values from 0.5 to 8 choose no better.
 _STDS_MM = (0.5, 2.0, 6.0)
+# What fits leave of groups of points where the model errs as ``sigma_mm`` and ``model_error`` say;
+# where less or more is left, it errs by less or more: in scenes of two kinds of physics 0.1 to 0.4.
+_USUAL_MISFIT_MM, _SCALES = 0.3, (0.32, 0.8)
+_FAR_OFF, _FAR_MM = 3.0, 0.3  # medians, and mm: groups farther off are none of the organ
+# Of coefficients that the points tell no better than by so much; as the library's loads have them.
+_UNSEEN_MM, _TOLD_MM = 2.0, 1.0
+# Of the library's states about their mean: most organs lie nearer to it than one normal
+# distribution says, some far off. Of one that shows little deformation evidence makes up no more.
+_SPREADS = (0.3, 1.0, 2.0)
 _LINEAR_STEPS = 2
-_STEPS = 1  # true ones; two and six leave the same errors
-_EVERY = 3  # the choice takes one of so many points, and is as good as with all
 _GROUPS = 64  # of neighbouring points, some 8 mm apart
 _ALIKE_MM = 1.0  # points farther from their group's median count little in its mean
 _JUDGED_WIDTH = 2.0  # neighbours that lie off together are rather the organ than strays
-# Of the determinants in the evidence. Points' noise is nearer to 0.5 mm than to ``sigma_mm``, which
-# also stands for the library's errors: so much less do they count beside the cost.
-_DETERMINANTS = 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class BentFit:
     """As ``RegistrationResult``; the motion's last coefficients are the compliance's, which have
-    this standard deviation. ``prior_slope``: of half the prior's cost, by the unknowns."""
+    this standard deviation. ``prior_slope``: of half the prior's cost, by the unknowns;
+    ``misfit_mm``: what the library's fit leaves of groups of points, root mean square."""
 
     motion: ElasticMotion
     looks: Looks
-    cost: float
     distances_mm: Float[np.ndarray, " n"]
     steps: int
     compliance_std_mm: float
+    misfit_mm: float
     prior_slope: Float64[np.ndarray, " p"]
     terms: Terms | None
 
@@ -58,20 +67,32 @@ class BentFit:
 def bend(fit: RegistrationResult, config: GaussNewtonConfig) -> BentFit:
     """A fit of the library, continued in the compliance that its points ask for; with its rivals,
     which stay as they are."""
-    start = _with_compliance(fit.motion)
-    evidence = fit.looks.evidence
-    terms = None if evidence is None else evidence.at(start)
-    std_mm = _Groups.near(fit, start, config, terms).likeliest_std_mm()
-    forces = np.eye(len(start.coefficients) - len(fit.motion.coefficients)) / std_mm**2
-    precision = _blocks(prior_precision(fit.motion.shape, config), forces)
-    near = msgspec.structs.replace(config, first_mm=config.last_mm)
-    descent = GaussNewton(start.shape, fit.looks, start, near, fit.moved, precision, terms)
-    descent.run(_STEPS)
-    bent = descent.result()
-    motion, steps = replace(bent.motion, rivals=fit.motion.rivals), fit.steps + bent.steps
-    slope = precision @ np.append(bent.moved, motion.coefficients - start.shape.body.mean)
+    start, looks = _with_compliance(fit.motion), fit.looks
+    misfit_mm = _misfit_mm(fit)
+    scale = min(max(misfit_mm / _USUAL_MISFIT_MM, _SCALES[0]), _SCALES[1])
+    config = msgspec.structs.replace(config, sigma_mm=scale * config.sigma_mm)
+    near = looks.residuals(start, config)
+    terms = None if looks.evidence is None else looks.evidence.at(start)
+    std_mm, spread = _Groups.near(fit, start, near, config, terms, scale).likeliest()
+    of_library = prior_precision(fit.motion.shape, config)
+    of_library[POSE:, POSE:] /= spread**2
+    precision = _blocks(of_library, _precision_of_forces(near, len(of_library), std_mm))
+    at = _Linear.at(start, fit.moved, near, looks, precision, terms, scale)
+    steps = 1 if terms is None else 2  # more leave the same errors; evidence is judged on the way
+    for _ in range(steps):
+        at = at.moved_by(looks, precision, config, scale)
+    count = len(precision)  # the rest are the cameras' errors
+    covariance = np.linalg.inv(at.curvature)[:count, :count]
+    motion = replace(at.motion, covariance=covariance, rivals=fit.motion.rivals)
     return BentFit(
-        motion, fit.looks, bent.cost, bent.distances_mm, steps, std_mm, slope, bent.terms
+        motion=motion,
+        looks=looks,
+        distances_mm=at.distances_mm,
+        steps=fit.steps + steps,
+        compliance_std_mm=std_mm,
+        misfit_mm=misfit_mm,
+        prior_slope=precision @ np.append(at.moved, motion.coefficients - start.shape.body.mean),
+        terms=at.terms,
     )
 
 
@@ -83,20 +104,104 @@ def _with_compliance(motion: ElasticMotion) -> ElasticMotion:
     return replace(motion, shape=shape, coefficients=coefficients, covariance=None)
 
 
+def _precision_of_forces(near: Residuals, known: int, std_mm: float) -> Float64[np.ndarray, "c c"]:
+    """Of the compliance's coefficients, after the first ``known`` unknowns: those that the points
+    tell are as the points say, those that they hardly tell may be of loads out of sight."""
+    rows = near.by_motion[:, known:]
+    told, axes = np.linalg.eigh(rows.T @ (rows * near.weights[:, None]))
+    told = np.maximum(told, 0.0) * _TOLD_MM**2
+    variances = (told * std_mm**2 + max(std_mm, _UNSEEN_MM) ** 2) / (told + 1)
+    return (axes / variances) @ axes.T
+
+
+def _misfit_mm(fit: RegistrationResult) -> float:
+    """What a fit leaves of groups of points, root mean square, without what is none of it."""
+    rows = np.column_stack([fit.distances_mm]).astype(np.float32)
+    means, counts, _ = _means_of_groups(rows, fit.motion.back(fit.looks.points_mm))
+    off_mm = np.abs(means[:, 0])
+    near = off_mm < _FAR_OFF * np.median(off_mm) + _FAR_MM
+    return float(np.sqrt(np.average(off_mm[near] ** 2, weights=counts[near])))
+
+
+@dataclass(frozen=True, eq=False)
+class _Linear:
+    """A Gauss-Newton step's equations at a motion that has ``moved`` from where the prior has the
+    pose: of it, and of further cameras' errors; those that neighbours share, and those of tools,
+    are marginalised."""
+
+    motion: ElasticMotion
+    moved: Float64[np.ndarray, " 6"]
+    distances_mm: Float64[np.ndarray, " n"]
+    terms: Terms | None
+    curvature: Float64[np.ndarray, "p p"]
+    gradient: Float64[np.ndarray, " p"]
+
+    @classmethod
+    def at(
+        cls,
+        motion: ElasticMotion,
+        moved: Float64[np.ndarray, " 6"],
+        near: Residuals,
+        looks: Looks,
+        precision: Float64[np.ndarray, "p p"],
+        terms: Terms | None,
+        scale: float,
+    ) -> _Linear:
+        """``near``, ``terms``: of the looks' points and evidence, there; ``scale``: of the model's
+        error."""
+        rows = np.concatenate([near.by_motion, near.by_cameras], axis=1)
+        off_mm, weights, places_mm = near.distances_mm, near.weights, looks.points_mm
+        count, cameras = len(precision), rows.shape[1] - len(precision)
+        errors = np.diag(np.tile(CAMERA_STD**-2, cameras // POSE))
+        change = np.append(moved, motion.coefficients - motion.shape.body.mean)
+        curvature = _blocks(precision, errors) + rows.T @ (rows * weights[:, None])
+        gradient = rows.T @ (weights * off_mm)
+        gradient[:count] += precision @ change
+        if terms is not None and looks.evidence is not None:
+            terms.add_to(curvature[:count, :count], gradient[:count])
+            on = looks.evidence.on_organ
+            of_places = np.pad(terms.by_motion[on], ((0, 0), (0, cameras)))
+            rows = np.concatenate([rows, of_places])
+            off_mm = np.append(off_mm, terms.residuals_mm[on])
+            weights = np.append(weights, terms.weights[on])
+            places_mm = np.concatenate([places_mm, looks.evidence.places_mm[on]])
+        error = motion.shape.model_error
+        node = error.nearest(motion.back(places_mm))
+        error.marginalise(curvature, gradient, node, rows, weights * off_mm, weights, scale)
+        return cls(motion, moved, near.distances_mm, terms, curvature, gradient)
+
+    def moved_by(
+        self,
+        looks: Looks,
+        precision: Float64[np.ndarray, "p p"],
+        config: GaussNewtonConfig,
+        scale: float,
+    ) -> _Linear:
+        """After a step."""
+        count = len(precision)  # the cameras stay
+        change = -np.linalg.solve(self.curvature[:count, :count], self.gradient[:count])
+        motion, evidence = self.motion.changed(change), looks.evidence
+        terms = None if evidence is None else evidence.at(motion).judged
+        near, moved = looks.residuals(motion, config), self.moved + change[:POSE]
+        return self.at(motion, moved, near, looks, precision, terms, scale)
+
+
 @dataclass(frozen=True, eq=False)
 class _Groups:
     """Mean distances of neighbouring points near a fit, and evidence, linear in the unknowns.
 
     Attributes:
         distances_mm: at the fit; ``at_mean_mm``: with the unknowns at their prior's mean.
-        by_library_mm2: the distances' covariance by pose and library; ``by_compliance_mm2``: by the
-            compliance with a standard deviation of 1 mm.
+        by_pose_mm2: the distances' covariance by the pose and what neighbours share;
+            ``by_library_mm2``: by the states; ``by_compliance_mm2``: by the compliance with a
+            standard deviation of 1 mm.
         weights: of the distances' squares in the cost.
         width_mm: the robust kernel's.
     """
 
     distances_mm: Float64[np.ndarray, " g"]
     at_mean_mm: Float64[np.ndarray, " g"]
+    by_pose_mm2: Float64[np.ndarray, "g g"]
     by_library_mm2: Float64[np.ndarray, "g g"]
     by_compliance_mm2: Float64[np.ndarray, "g g"]
     weights: Float64[np.ndarray, " g"]
@@ -107,46 +212,58 @@ class _Groups:
         cls,
         fit: RegistrationResult,
         start: ElasticMotion,
+        at: Residuals,
         config: GaussNewtonConfig,
         terms: Terms | None,
+        scale: float,
     ) -> _Groups:
-        """``start``: the fit's motion, with compliance; ``terms``: of evidence, there."""
-        points_mm, body = fit.looks.points_mm[::_EVERY], fit.motion.shape.body
-        means, counts = _means_of_groups(start.residual_rows(points_mm), start.back(points_mm))
-        weights = _EVERY * fit.looks.weight(config) * counts
+        """``start``: the fit's motion, with compliance; ``at``, ``terms``: there."""
+        body, points_ct = fit.motion.shape.body, start.back(fit.looks.points_mm)
+        rows = np.column_stack([at.by_motion, at.distances_mm]).astype(np.float32)
+        means, counts, middles_ct = _means_of_groups(rows, points_ct)
+        weights = fit.looks.weight(config) * counts
         width_mm = np.full(len(counts), fit.looks.width_mm(config))
         if terms is not None:
             means = np.concatenate([means, np.column_stack([terms.by_motion, terms.residuals_mm])])
             weights = np.append(weights, terms.std_mm**-2.0)
             width_mm = np.append(width_mm, terms.width_mm)
         shared = np.zeros((len(means), len(means)))
+        shared[: len(counts), : len(counts)] = scale**2 * covariance_mm2(middles_ct)
         if terms is not None:
             shared[len(counts) :, len(counts) :] = terms.by_shifts @ terms.by_shifts.T
         by_library, by_compliance, distances_mm = np.split(means, [POSE + len(body.mean), -1], 1)
         pose_std = np.repeat([config.shift_mm, config.turn_rad], 3)
-        prior = _blocks(np.diag(pose_std**2), body.covariance)
+        by_pose = by_library[:, :POSE] * pose_std
+        by_states = by_library[:, POSE:]
         off = np.append(fit.moved, fit.motion.coefficients - body.mean)
         return cls(
             distances_mm=distances_mm[:, 0],
             at_mean_mm=distances_mm[:, 0] - by_library @ off,
-            by_library_mm2=by_library @ prior @ by_library.T + shared,
+            by_pose_mm2=by_pose @ by_pose.T + shared,
+            by_library_mm2=by_states @ body.covariance @ by_states.T,
             by_compliance_mm2=by_compliance @ by_compliance.T,
             weights=weights,
             width_mm=width_mm,
         )
 
-    def likeliest_std_mm(self) -> float:
-        """Of the compliance."""
-        return min(_STDS_MM, key=self.cost)
+    def likeliest(self) -> tuple[float, float]:
+        """Standard deviation of the compliance, and by what the library's are multiplied (root mean
+        square over all that are likely)."""
+        costs = np.array([[self.cost(std, s) for s in _SPREADS] for std in _STDS_MM])
+        shares = np.exp((costs.min() - costs) / 2)
+        squares = np.average(np.tile(np.square(_SPREADS), (len(costs), 1)), weights=shares)
+        return _STDS_MM[int(costs.min(1).argmin())], float(np.sqrt(squares))
 
-    def cost(self, std_mm: float) -> float:
-        """-2 log of the evidence of a standard deviation, up to a constant.
+    def cost(self, std_mm: float, spread: float = 1.0) -> float:
+        """-2 log of the evidence of the compliance's deviation and the library's spread, up to a
+        constant.
 
         With distances d + J x, covariance C of x, and robust weights W, the likeliest x is -C J' z,
         where z = (J C J' + 1 / W)^-1 d: a small system, since groups are fewer than unknowns. Its
         determinant, times W's, is that of the posterior's precision over the prior's.
         """
-        explained = self.by_library_mm2 + std_mm**2 * self.by_compliance_mm2
+        explained = self.by_pose_mm2 + spread**2 * self.by_library_mm2
+        explained += std_mm**2 * self.by_compliance_mm2
         residuals_mm = self.distances_mm
         for _ in range(_LINEAR_STEPS):
             roots = np.sqrt(self.weights) / (1 + (residuals_mm / self.width_mm) ** 2)
@@ -157,7 +274,7 @@ class _Groups:
         width_mm = _JUDGED_WIDTH * self.width_mm
         squares = (residuals_mm / width_mm) ** 2
         misfit = (width_mm**2 * self.weights) @ (squares / (1 + squares))
-        determinant = _DETERMINANTS * 2 * np.log(np.diag(factor[0])).sum()
+        determinant = 2 * np.log(np.diag(factor[0])).sum()
         return float(misfit + pulls @ explained @ pulls + determinant)
 
 
@@ -168,9 +285,9 @@ def _blocks(a: Float64[np.ndarray, "p p"], b: Float64[np.ndarray, "c c"]) -> np.
 
 def _means_of_groups(
     rows: Float32[np.ndarray, "n q"], points_ct: Float64[np.ndarray, "n 3"]
-) -> tuple[Float64[np.ndarray, "g q"], Int64[np.ndarray, " g"]]:
-    """Each group's mean row, without what lies off the median distance (the last column), and how
-    many points it has."""
+) -> tuple[Float64[np.ndarray, "g q"], Int64[np.ndarray, " g"], Float64[np.ndarray, "g 3"]]:
+    """Each group's mean row, without what lies off the median distance (the last column), how many
+    points it has, and their middle."""
     group, distances = _grouped(points_ct), rows[:, -1]
     order = np.lexsort([distances, group])
     group, distances = group[order], distances[order]
@@ -180,7 +297,8 @@ def _means_of_groups(
     weights = 1 / (1 + ((distances - median[group]) / _ALIKE_MM) ** 2) ** 2
     weights /= np.add.reduceat(weights, first)[group]
     means = np.add.reduceat(rows[order] * weights.astype(np.float32)[:, None], first)
-    return means.astype(float), counts
+    middles_ct = np.add.reduceat(points_ct[order], first) / counts[:, None]
+    return means.astype(float), counts, middles_ct
 
 
 def _grouped(points_ct: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:

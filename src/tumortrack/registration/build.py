@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from typing import Any
 
@@ -143,9 +143,9 @@ def _compared_with_truth(
     """The factor for standard deviations, 1 or more, and how far off the answers were."""
     errors, nearest, ratios = [], [], []
     for scene, fit in zip(scenes, fits, strict=False):
-        _, bent = registration.bend(fit)
+        bent = registration.bend(fit)
         share = depth_error.share(bent.motion.centre_mm[2])
-        covariance_mm2 = registration.uncertain(bent, share).covariance_mm2(inner_ct)
+        covariance_mm2 = replace(bent.motion, depth_share=share).covariance_mm2(inner_ct)
         assert covariance_mm2 is not None
         away = bent.motion.carry(inner_ct) - scene.inner_mm
         errors.append(scene.off_mm(bent.motion, inner_ct))

@@ -1,15 +1,15 @@
 """Evidence beside the points, as terms of the fit: residuals, derivatives by the motion, weights.
 
 A place on or off a part's surface has one residual, its signed distance to the surface; a point of
-the CT at a known place has three. Each counts by its own deviation, with the points' robust kernel:
-what lies far off counts little, and is named afterwards.
+the CT at a known place has three. Each counts by its own deviation, on the way to a fit with the
+points' robust kernel, then as true or false (``Terms.judged``): what is rather false is named.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
 from typing import Any
@@ -29,6 +29,8 @@ from tumortrack.registration.rest_shape import RestShape
 _WIDTHS = 4.0  # of the robust kernel, in standard deviations
 _LEAST_WIDTH_MM = 4.0  # so that fits from starts some millimetres off are drawn
 _SURFACE_MM = 1.0  # of the model's surfaces, segmentation included: ``sigma_mm`` of the points
+# Of single places a share is of something else, and lies anywhere within a hand's breadth: assumed.
+_FALSE, _WITHIN_MM = 0.05, 40.0
 _RIGID_MM = 4.0  # error of the undeformed organ at best
 # Error along an axis of where tissue is said to go, per way that it went: in 113 frames of two
 # sequences of the phantom under finite elements (pressed, pushed) the median is 0.05, and 90 % are
@@ -51,11 +53,27 @@ class Terms:
     std_mm: Float64[np.ndarray, " t"]
     width_mm: Float64[np.ndarray, " t"]  # of the robust kernel
     piece: Int64[np.ndarray, " t"]  # the number of the evidence that each belongs to
+    place: Int64[np.ndarray, " t"]  # and of the place
+    true: Float64[np.ndarray, " t"] | None = None  # the chance that it is, once judged
 
     @cached_property
     def weights(self) -> Float64[np.ndarray, " t"]:
         """Of their squares in the cost."""
+        if self.true is not None:
+            return self.true / self.std_mm**2
         return 1 / (self.std_mm * (1 + (self.residuals_mm / self.width_mm) ** 2)) ** 2
+
+    @property
+    def judged(self) -> Terms:
+        """Each counts as likely as it is true: of those about a place together, with its tool's
+        shift allowed for, a share ``_FALSE`` lies anywhere (a mixture; Aitkin and Wilson 1980, doi
+        10.2307/1268316)."""
+        off = (self.residuals_mm + self.by_shifts @ self.shifts) / self.std_mm
+        place = self.place
+        squares = np.bincount(place, off**2)
+        logs = np.bincount(place, np.log(self.std_mm * np.sqrt(2 * np.pi) / _WITHIN_MM))
+        odds = _FALSE / (1 - _FALSE) * np.exp(np.minimum(squares / 2, 100.0) + logs)
+        return replace(self, true=(1 / (1 + odds))[place])
 
     @cached_property
     def cost(self) -> float:
@@ -76,9 +94,13 @@ class Terms:
 
     @property
     def contradicting(self) -> Int64[np.ndarray, " k"]:
-        """Numbers of the evidence that lies too far off, its tool's shift allowed for."""
-        off_mm = np.abs(self.residuals_mm + self.by_shifts @ self.shifts)
-        return np.unique(self.piece[off_mm > np.maximum(_WIDTHS * self.std_mm, _LEAST_WIDTH_MM)])
+        """Numbers of the evidence of which two places, or half of them, are rather false."""
+        true = self.judged.true
+        assert true is not None
+        first = np.unique(self.place, return_index=True)[1]
+        of, false = self.piece[first], true[first] < 0.5
+        count, wrong = np.bincount(of), np.bincount(of, false)
+        return np.flatnonzero((wrong >= 2) | (2 * wrong >= np.maximum(count, 1)))
 
     def add_to(self, curvature: Float64[np.ndarray, "p p"], gradient: np.ndarray) -> float:
         """Into a Gauss-Newton step's equations; the terms' cost."""
@@ -167,7 +189,8 @@ class EvidenceTerms:
         by_shifts = [by_all[:, :3] * ((tool == n) * self.shared_mm[n])[:, None] for n in shifted]
         width_mm = np.maximum(_WIDTHS * np.hypot(std_mm, self.shared_mm[tool]), _LEAST_WIDTH_MM)
         shifts = np.concatenate([by_all[:, :0], *by_shifts], axis=1)
-        return Terms(together, by_all, shifts, std_mm, width_mm, piece)
+        place = np.repeat(np.arange(len(times)), times)
+        return Terms(together, by_all, shifts, std_mm, width_mm, piece, place)
 
     def rigid_costs(
         self,
@@ -191,27 +214,23 @@ class EvidenceTerms:
             costs += _WIDTHS**2 * squares / (1 + squares)
         return costs
 
-    def without(self, pieces: Int64[np.ndarray, " k"]) -> EvidenceTerms:
-        """The rest."""
-        kept = ~np.isin(self.piece, pieces)
-        places, points = np.split(kept, [len(self.places_mm)])
-        return EvidenceTerms(
-            self.places_mm[places], self.part[places], self.offset_mm[places], self.free[places],
-            self.points_ct[points], self.points_mm[points], self.std_mm[kept], self.piece[kept],
-            self.tool[kept], self.shared_mm,
-        )  # fmt: skip
+    @property
+    def places_of_tissue_mm(self) -> Float64[np.ndarray, "n 3"]:
+        """Camera frame."""
+        return np.concatenate([self.places_mm[~self.free], self.points_mm])
+
+    @property
+    def on_organ(self) -> Int64[np.ndarray, " o"]:
+        """Which terms are of places on the organ's surface, which err with it."""
+        return np.flatnonzero((self.part == 0) & ~self.free)
 
     def described(
         self, evidence: Sequence[Evidence], motion: ElasticMotion, before: int, terms: Terms
     ) -> tuple[EvidenceReport, ...]:
-        """For a report: all ``evidence``, of which this is what was not left out, with its
-        ``terms``; the first pieces came ``before`` this frame."""
+        """For a report: ``evidence``, with its ``terms`` at the motion; the first pieces came
+        ``before`` this frame."""
         assert motion.covariance is not None
-        anatomy_ct, kept = motion.shape.anatomy_ct, set(self.piece.tolist())
-        if len(kept) < len(evidence):
-            whole = EvidenceTerms.of(evidence, tuple(anatomy_ct.closed))
-            assert whole is not None
-            terms = whole.at(motion)
+        anatomy_ct, out = motion.shape.anatomy_ct, set(terms.contradicting.tolist())
         known = ((terms.by_motion @ motion.covariance) * terms.by_motion).sum(1)
         starts = np.unique(terms.piece, return_index=True)[1]  # rows of a piece are neighbours,
         order = np.argsort(starts)  # landmarks' after all others'
@@ -222,7 +241,7 @@ class EvidenceTerms:
         told = []
         for number, each in enumerate(evidence):
             off = float(off_mm[number])
-            if number not in kept and isinstance(each, Touch | Outline):  # perhaps beyond the field
+            if number in out and isinstance(each, Touch | Outline):  # perhaps beyond the field
                 surface = anatomy_ct.closed[each.part or anatomy_ct.names[0]]
                 off = float(surface_distance(surface, motion.back(np.array(each.places))).max())
             told.append(
@@ -232,8 +251,8 @@ class EvidenceTerms:
                     tool=each.tool,
                     std_mm=each.std_mm,
                     off_mm=off,
-                    news=min(float(shares[number]), 1.0) if number in kept else 0.0,
-                    left_out=number not in kept,
+                    news=min(float(shares[number]), 1.0),
+                    left_out=number in out,
                     before=number < before,
                     places_mm=each.places,
                 )

@@ -152,7 +152,7 @@ class RegistrationLocator:
         frame = Frame(self._model, cloud, seed, np.random.default_rng(seed), fewest)
         points = self._points(frame, looks, evidence=EvidenceTerms.of(evidence, self._touchable))
         fit = self._registration.register(points, None, frame.stage)
-        fit, bent = self._bent(fit, frame)
+        bent = self._bent(fit, frame)
         size = apparent_size(fit.motion, fit.looks, self._registration.config)
         placed = self._checked(fit, bent, size, frame)
         organ = placed.meshes[self._model.parts[0]]
@@ -183,7 +183,7 @@ class RegistrationLocator:
         # As many points in all as of one look: faster by half, and tumors within 0.05 mm as good.
         points = self._points(frame, looks, every=len(looks))
         found = self._fit_after(last, points, how, frame)
-        fit, bent = self._bent(found.fit, frame)
+        fit, bent = found.fit, self._bent(found.fit, frame)
         bent, lag_s = self._smoothed(bent, last, cloud.stamp_ns, how.smoothing_s)
         size = apparent_size(fit.motion, fit.looks, self._registration.config)
         placed = self._checked(fit, bent, size, frame)
@@ -319,11 +319,11 @@ class RegistrationLocator:
         looks = Looks.of([points])
         fit = self._registration.best_fit(looks, [*self._registration.search.starts(looks), rest])
         size = apparent_size(fit.motion, fit.looks, self._registration.config)
-        self._carry(self._moved(*self._registration.bend(fit), size), 0)
+        self._carry(self._moved(fit, self._registration.bend(fit), size), 0)
         for surface in range(len(self._touchable)):
             self._shape.field(surface)
 
-    def _bent(self, fit: RegistrationResult, frame: Frame) -> tuple[RegistrationResult, BentFit]:
+    def _bent(self, fit: RegistrationResult, frame: Frame) -> BentFit:
         with frame.stage("bend"):
             return self._registration.bend(fit)
 
@@ -339,7 +339,8 @@ class RegistrationLocator:
         share, looks = 0.0, fit.looks
         if len(looks.points_mm):
             share = depth_share(size, bent.motion.centre_mm[2], looks.depth_error)
-        motion = self._registration.uncertain(bent, share, self._calibration.std_scale)
+        std_scale = self._calibration.std_scale
+        motion = replace(bent.motion, depth_share=share, std_scale=std_scale)
         anatomy = self._shape.anatomy_ct
         moved = motion.carry(self._vertices_ct)
         ends = np.cumsum([len(mesh.vertices_mm) for mesh in self._surfaces])[:-1]
@@ -370,6 +371,9 @@ class RegistrationLocator:
         on_surface_mm = np.split(placed.sample_fit_std_mm, self._sample_ends)
         fit_mm = zip(placed.middle_fit_std_mm, map(np.max, on_surface_mm), strict=True)
         held_mm = held_by_prior_mm(placed.motion, bent.prior_slope)
+        known_mm, evidence = fit.looks.points_mm, fit.looks.evidence
+        if evidence is not None:
+            known_mm = np.concatenate([known_mm, evidence.places_of_tissue_mm])
         deviations = {
             name: {
                 "held_by_prior_mm": held,
@@ -378,7 +382,7 @@ class RegistrationLocator:
                     center_mm2,
                     surface_mm2,
                     placed.meshes[name].box_mm.mean(0),
-                    fit.looks.points_mm,
+                    known_mm,
                 ),
             }
             for name, held, (middle_mm, surface_mm), center_mm2, surface_mm2 in zip(

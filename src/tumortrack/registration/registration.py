@@ -11,8 +11,8 @@
    kept as rivals; one that explains them better in a pose that the case excludes makes the answer
    poor.
 5. Verdict (`models.in_distribution`): what cannot be this organ is refused.
-6. Bend (`bend`): what the library's states cannot follow, the body's compliance does.
-7. Uncertainty (`uncertainty`): what the points leave open.
+6. Bend (`bend`): what the library's states cannot follow, the body's compliance does; with it, what
+   points and evidence leave open.
 
 The result is a motion (`motion`): any point of the CT, carried to the camera's frame and back, with
 its uncertainty. `locator` makes surfaces, labels and a report of it.
@@ -48,7 +48,6 @@ from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.rest_shape import RestShape
 from tumortrack.registration.search import PosePrior, Search, Start, far_from, turned_starts
-from tumortrack.registration.uncertainty import posterior
 
 Timer = Callable[[str], AbstractContextManager[object]]
 
@@ -127,17 +126,9 @@ class Registration:
         """The fit near a motion."""
         return self._correct_cameras(looks, refine(self.rest, looks, start, config))
 
-    def bend(self, fit: RegistrationResult) -> tuple[RegistrationResult, BentFit]:
-        """A fit, and it in the body's compliance; both without what contradicts the rest."""
-        bent = bend(fit, self.config)
-        evidence = fit.looks.evidence
-        if evidence is None or bent.terms is None or not len(wrong := bent.terms.contradicting):
-            return fit, bent
-        looks = replace(fit.looks, evidence=evidence.without(wrong))
-        near = msgspec.structs.replace(self.config, first_mm=self.config.last_mm)
-        fits = [self.follow(looks, each.motion, near) for each in (fit, *fit.others)]
-        fit = likeliest(fits, self.prior)
-        return fit, bend(fit, self.config)
+    def bend(self, fit: RegistrationResult) -> BentFit:
+        """A fit in the body's compliance."""
+        return bend(fit, self.config)
 
     def check(self, fit: RegistrationResult, usual: InDistributionRange) -> None:
         """Raises NotThisOrgan: points or deformation are none of this organ's."""
@@ -146,15 +137,6 @@ class Registration:
             points_mm, distances_mm = fit.looks.points_mm[mine], np.abs(fit.distances_mm[mine])
             check_in_distribution(usual, points_mm, distances_mm, registered=True)
         check_likely(fit.motion.rarity)
-
-    def uncertain(self, bent: BentFit, depth_share: float, std_scale: float = 1.0) -> ElasticMotion:
-        """The motion of ``bend`` with its covariance: see ``ElasticMotion``."""
-        return replace(
-            bent.motion,
-            covariance=posterior(bent.motion, bent.looks, self.config),
-            depth_share=depth_share,
-            std_scale=std_scale,
-        )
 
     def best_fit(
         self,

@@ -72,6 +72,7 @@ def motion_entry(motion: ElasticMotion, fit: RegistrationResult, bent: BentFit) 
         rarity=fit.motion.rarity,
         steps=bent.steps,
         compliance_std_mm=bent.compliance_std_mm,
+        misfit_mm=bent.misfit_mm,
         depth_share=motion.depth_share,
     )
 

@@ -14,6 +14,7 @@ from tumortrack.core.organ import KIDNEY, Organ, check_name
 from tumortrack.core.process import parallel_for
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.registration.kernels import DistanceField, mark
+from tumortrack.registration.model_error import ModelError
 from tumortrack.simulate.elastic.body import ElasticBody
 
 _STEPS = 40  # of a distance field, along the part's longest side
@@ -48,6 +49,11 @@ class RestShape:
     def compliant(self) -> RestShape:
         """The same organ with the body's compliance among its modes."""
         return replace(self, body=self.body.compliant)
+
+    @cached_property
+    def model_error(self) -> ModelError:
+        """Of the organ's surface."""
+        return ModelError.of(self.anatomy_ct.organ)
 
     @cached_property
     def long_axis_mm(self) -> Float64[np.ndarray, " 3"]:

@@ -14,20 +14,6 @@ _LEAST_KNOWN = 1.0  # of a size: nothing, where rounding leaves less
 _LESS = 0.05  # share of the prior's weight: first order, and no float32 noise
 
 
-def posterior(
-    motion: ElasticMotion, looks: Looks, config: GaussNewtonConfig
-) -> Float64[np.ndarray, "p p"]:
-    """The covariance of a fitted motion: the inverse of the cost's curvature, widened by what the
-    further cameras' errors leave open (Schur complement)."""
-    covariance = motion.covariance
-    assert covariance is not None
-    if looks.count > 1:
-        precision, across = looks.residuals(motion, config).cameras_precision(covariance)
-        follows = covariance @ across
-        covariance = covariance + follows @ np.linalg.solve(precision, follows.T)
-    return covariance
-
-
 def held_by_prior_mm(motion: ElasticMotion, prior_slope: Float64[np.ndarray, " p"]) -> list[float]:
     """How far the prior, against the points, holds the middle of each part: to first order, how far
     each moves per share of the prior's weight taken away. ``prior_slope``: see ``BentFit``."""

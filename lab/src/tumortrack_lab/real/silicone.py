@@ -185,7 +185,7 @@ def located(tracker: Tracker, cloud: SensorCloud) -> tuple[dict[str, Any], Any]:
         looks = Looks.of([frame.points_mm])
         fit = model.registration.register(looks, None, frame.stage)
         words = {"verdict": "refused", "reason": str(error), "cost": fit.cost / usual}
-        return words, model.registration.bend(fit)[1].motion
+        return words, model.registration.bend(fit).motion
     costs = estimate.report.fit_cost
     assert costs is not None  # of the default method
     cost = costs.now / costs.usual

@@ -19,8 +19,9 @@ from scipy.spatial import cKDTree
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
-from tumortrack.core.evidence import Evidence, Held, Landmark, Outline, Touch
+from tumortrack.core.evidence import Evidence, Free, Held, Landmark, Outline, Touch
 from tumortrack.core.geometry import perpendicular, plane_section, triangles_of, turned_by, unit
+from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import Mesh
 from tumortrack.simulate.scene_folder import Scene, Targets
 
@@ -29,6 +30,7 @@ Points = Float[np.ndarray, "n 3"]
 
 _UNSEEN_MM = 8.0  # from any point of the cloud: well beyond its noise and spacing
 _PLACES = 12  # of an outline
+_SHAFT_MM, _SHAFT_RADIUS_MM = (5.0, 60.0), 3.0  # from the surface
 _SEEN_SHARE = 0.2  # of the inner points, those nearest to the cloud: what a person can recognise
 
 
@@ -117,7 +119,7 @@ class EvidenceSource:
         return self.touches(centres[chosen], doubled[chosen])
 
     def drawn(self, numbers: Mapping[str, int]) -> list[Piece]:
-        """So many pieces of each kind (``touch``, ``landmark``, ``held``), at random; of outlines,
+        """So many pieces of each kind (touch, landmark, held, free), at random; of outlines,
         so many of each tumor. Raises InputError: the scene has no points to recognise or hold."""
         if self.scene.targets is None and numbers.keys() & {"landmark", "held"}:
             raise InputError(
@@ -131,6 +133,7 @@ class EvidenceSource:
             *(outline for outline in outlines if outline is not None),
             *(self.landmarks(n) if (n := numbers.get("landmark", 0)) else ()),
             *(self.held(n % max(tumors, 1)) for n in range(numbers.get("held", 0))),
+            *(self.free() for _ in range(numbers.get("free", 0))),
         ]
 
     def outline(self, tumor: int, normal: Float[np.ndarray, " 3"] | None = None) -> Piece | None:
@@ -187,6 +190,17 @@ class EvidenceSource:
             std_mm=max(errors.tip_mm, _LEAST_STD_MM), tool="robot",
         )  # fmt: skip
         return Piece(held, bool(slipped))
+
+    def free(self) -> Piece:
+        """Places along a tool's shaft that stands on the organ's surface."""
+        organ = self.scene.reference.organ
+        centres, doubled = triangles_of(organ.vertices_mm, organ.faces)
+        face, way = self.rng.integers(len(centres)), np.linspace(*_SHAFT_MM, _PLACES)
+        along = centres[face] + way[:, None] * unit(doubled[face])
+        along = along[~contains(organ, along)]  # it may meet another fold
+        told = self._by_robot(along) + self.rng.normal(0, self.errors.tip_mm, along.shape)
+        stated = self._stated(along.mean(0), self.errors.tip_mm)
+        return Piece(Free(places_mm=_tuples(told), tip_mm=_SHAFT_RADIUS_MM, **stated))
 
     def _touch(self, aim_mm: np.ndarray, outward: np.ndarray) -> Piece:
         errors, rng = self.errors, self.rng

@@ -9,19 +9,21 @@ import tumortrack as tt
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.simulate.scene_folder import list_scenes
-from tumortrack_lab.world.kidneys import random_anatomy
+from tumortrack_lab.world.kidneys import SHAPES, random_anatomy
 from tumortrack_lab.world.scenes import TETS, World, WorldConfig
 
 
-def scenes_of_kidney(folder: Path, number: int, states: int) -> list[Path]:
-    """Scenes of this random kidney's first states, families in turn; what is missing is made:
-    FOLDER/case and FOLDER/scenes. Some have no equilibrium, or no organ in the image."""
+def scenes_of(folder: Path, number: int, states: int, shape: str = "kidney") -> list[Path]:
+    """Scenes of this random organ's first states, families in turn; what is missing is made:
+    FOLDER/case and FOLDER/scenes. Some have no equilibrium, or no organ in the image. ``shape``:
+    of ``SHAPES``."""
     case, scenes = folder / "case", folder / "scenes"
     if not case.exists():
-        anatomy_ct, up_lps = random_anatomy(number)
+        anatomy_ct, up_lps = random_anatomy(number, SHAPES[shape])
         with TemporaryDirectory() as aside:
             write_anatomy(Path(aside), anatomy_ct)
-            tt.prepare(aside, case, up=",".join(f"{value:.6f}" for value in up_lps))
+            up = ",".join(f"{value:.6f}" for value in up_lps)
+            tt.prepare(aside, case, up=up, name=shape)
     scenes.mkdir(exist_ok=True)
     # What is missing before the last that was made was tried, and failed.
     tried = max((_state(path) for path in scenes.iterdir() if path.is_dir()), default=-1) + 1

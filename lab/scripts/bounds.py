@@ -1,0 +1,121 @@
+"""Learn how far off parts may be, from random organs in all families of the wider world's physics.
+
+    make bounds ARGS='OUT --kidneys 12'     (an hour on two cores)
+
+Makes organs, their models and scenes in OUT, locates each scene with and without evidence, by its
+cloud and its depth image, hidden and noisy, and fits ``assessment.bound`` to how far off the parts
+are; writes it to ``--write``. Prints, or fills in a document's block, what it is worth for organs,
+families of physics and kinds of evidence that were left out. The same command goes on where it was
+stopped. No patient's anatomy is in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import pandas as pd
+import tyro
+
+import tumortrack as tt
+from tumortrack.cli.console import model_folder, progress_bar
+from tumortrack.core import store
+from tumortrack.core.config import to_builtins
+from tumortrack.core.process import available_cores
+from tumortrack.simulate.scene_folder import read_scene
+from tumortrack.tracking.fingerprint import fingerprint
+from tumortrack.tracking.tracker import Tracker
+from tumortrack_lab.study import bounds, scripts
+from tumortrack_lab.study.document import share_words, table_of
+from tumortrack_lab.study.tables import NOTHING
+from tumortrack_lab.world.made import scenes_of
+
+_BLOCK = "bounds"
+_FIRST = {"kidney": 1000, "prostate": 2000, "liver": 3000}  # numbers of organs
+
+
+@dataclass(frozen=True)
+class Options:
+    """Learn how far off parts may be."""
+
+    out: tyro.conf.Positional[Path]
+    """Folder of organs and scenes."""
+    kidneys: int = 12
+    """So many."""
+    others: int = 3
+    """Livers, and as many prostates."""
+    states: int = 40
+    """Of each; families take turns."""
+    write: Path | None = None
+    """File for what was learned: src/tumortrack/assessment/bounds.json."""
+    document: Path | None = None
+    """A page that shows the tables, which go beside it."""
+
+
+def main(options: Options) -> None:
+    """Make what is missing, then fit."""
+    writer = scripts.begun("bounds", options.document)
+    options.out.mkdir(parents=True, exist_ok=True)
+    organs = list(_organs(options))
+    with ProcessPoolExecutor(available_cores(), get_context("spawn")) as pool:
+        jobs = [pool.submit(_organ, options.out, *each, options.states) for each in organs]
+        with progress_bar("organs", len(jobs)) as advance:
+            for job in as_completed(jobs):
+                job.result()
+                advance()
+    paths = [_rows_path(options.out, number, options.states) for _, number in organs]
+    rows = pd.concat([pd.read_json(path, lines=True) for path in paths], ignore_index=True)
+    asked = ({"part": "organ", "by": "family"}, {"part": "organ", "by": "shape"},
+             {"part": "family"}, {"part": "evidence"}, {"part": "shape"})  # fmt: skip
+    tables = [bounds.left_out(rows, **each).astype(object).fillna(NOTHING) for each in asked]
+    print(*map(table_of, tables), sep="\n\n")
+    named = [table.rename(columns={table.columns[0]: "left out"}) for table in tables[2:]]
+    written = {_BLOCK: pd.concat(tables[:2]), f"{_BLOCK}-left-out": pd.concat(named)}
+    sample = f"{len(rows)} parts in answers of {len(organs)} random organs"
+    writer.tables(written, sample=sample, interval=f"over 5 mm {_over(tables[0])} of good")
+    about = {"organs": len(organs), "states": options.states}
+    learned = bounds.learned(rows, about)
+    if options.write is not None:
+        store.write_json(options.write, to_builtins(learned))
+
+
+def _organs(options: Options) -> Iterator[tuple[str, int]]:
+    """Shape and number."""
+    for shape, first in _FIRST.items():
+        count = options.kidneys if shape == "kidney" else options.others
+        yield from ((shape, first + n) for n in range(count))
+
+
+def _over(short: pd.DataFrame) -> str:
+    """Of all good answers."""
+    of_all = short.iloc[-1]
+    good = round(int(of_all["answers"]) * int(of_all["good %"]) / 100)
+    return share_words(int(of_all["center over 5 mm"]), good)
+
+
+def _rows_path(out: Path, number: int, states: int) -> Path:
+    """Rows are of one version of the method, and of so many states."""
+    return out / str(number) / f"bounds-{fingerprint()}-{states}.jsonl"
+
+
+def _organ(out: Path, shape: str, number: int, states: int) -> None:
+    """An organ's scenes and rows."""
+    folder, rows_path = out / str(number), _rows_path(out, number, states)
+    scenes = scenes_of(folder, number, states, shape)
+    if rows_path.exists():
+        return
+    tracker = Tracker(tt.load_model(model_folder(folder / "case"), "cpu"))
+    rows = [
+        {"shape": shape, "organ": number, "scene": scene.name, **row}
+        for seed, scene in enumerate(scenes)
+        for row in bounds.rows_of(tracker, read_scene(scene), seed)
+    ]
+    text = pd.DataFrame(rows).to_json(orient="records", lines=True)
+    store.write_atomically(rows_path, text.encode())
+
+
+if __name__ == "__main__":
+    scripts.run(main, Options)

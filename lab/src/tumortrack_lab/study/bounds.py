@@ -1,0 +1,226 @@
+"""Learns ``tumortrack.assessment.bound`` from located scenes, and tests it on what is left out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+from scipy.interpolate import RBFInterpolator
+from scipy.optimize import minimize
+from scipy.stats import spearmanr
+
+from tumortrack.assessment.bound import POOR_MM, BoundModel, Quantile, figures
+from tumortrack.core.errors import NoEstimate
+from tumortrack.core.estimate import FAR_MM, Estimate
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.organ import is_tumor
+from tumortrack.core.report import FAR_OFF
+from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.registration.model import RegistrationModel
+from tumortrack.report.rivals import best_rigid_pose, rigid_fit
+from tumortrack.simulate.scene_folder import Scene
+from tumortrack.tracking.fingerprint import fingerprint
+from tumortrack.tracking.tracker import Tracker
+from tumortrack_lab.world.evidence import ALL_TRUE, ERRORS, EvidenceSource, hidden
+
+Generator = np.random.Generator
+_CONFIDENCE = 0.95
+_LEAST_MM, _LOST_MM = 0.1, 30.0  # misses: less is noise; more are other minima, which fits refuse
+_KNOTS = (0.02, 0.5, 0.85)  # quantiles of a figure from which it counts
+_SMOOTH_MM = 0.05  # of the pinball's corner, so that its slope is one
+_RIDGE = 1e-3  # pulls weights that tell nothing to 0
+_VERTICES = 300  # of a part, where its miss is measured
+_ANSWER = ["organ", "scene", "answer"]
+_ABOUT = {
+    *_ANSWER, "shape", "family", "by", "evidence", "part", "miss_mm", "center_mm", "rigid_fit_mm",
+    "finding", "bound_mm",
+}  # fmt: skip
+EVIDENCE: tuple[dict[str, int], ...] = (
+    {"touch": 1}, {"touch": 4}, {"touch": 12}, {"touch": 40}, {"outline": 1}, {"outline": 2},
+    {"landmark": 1}, {"landmark": 3}, {"landmark": 6}, {"held": 1}, {"touch": 12, "outline": 1},
+    {"free": 3},
+)  # fmt: skip
+
+
+class _Asked(NamedTuple):
+    """What an answer is given: a scene, what judges it, and how many pieces of evidence."""
+
+    scene: Scene
+    seen: DepthFrame | None
+    evidence: Mapping[str, int]
+    false_too: bool = False
+
+
+def rows_of(tracker: Tracker, scene: Scene, seed: int) -> Iterator[dict[str, Any]]:
+    """A row a part and answer: the largest miss of its points, its centre's, its figures, and the
+    verdict so far. The scene is asked alone, by cloud and by image, then in pairs without and with
+    evidence, of half of them a share hidden, noisy or both. Without an answer there is none."""
+    model, rng = tracker.model, np.random.default_rng([seed, 53])
+    assert isinstance(model, RegistrationModel)
+    for number, asked in enumerate(_asked(scene, rng)):
+        source = EvidenceSource.of(
+            asked.scene, [seed, number], ERRORS if asked.false_too else ALL_TRUE
+        )
+        pieces = [piece.evidence for piece in source.drawn(asked.evidence)]
+        try:
+            found = tracker.locate(asked.scene.cloud, 8, 0, asked.seen, pieces)
+        except NoEstimate:
+            continue
+        rigid_mm = _rigid_misses(model, asked.scene) if number == 0 else {}
+        kinds = "+".join(sorted(asked.evidence)) or "none"
+        for name, largest_mm, center_mm in _misses(found, scene, model):
+            known = figures(found.report, name)
+            if known is not None:
+                yield {
+                    "answer": number,
+                    "family": scene.meta["family"],
+                    "by": "cloud" if asked.seen is None else "image",
+                    "evidence": kinds,
+                    "part": name,
+                    "miss_mm": largest_mm,
+                    "center_mm": center_mm,
+                    "rigid_fit_mm": rigid_mm.get(name, np.nan),
+                    "finding": None if found.finding is None else found.finding.kind,
+                    **known,
+                }
+
+
+def _asked(scene: Scene, rng: Generator) -> Iterator[_Asked]:
+    yield _Asked(scene, None, {})
+    if scene.depth is not None:
+        yield _Asked(scene, scene.depth, {})
+    for _ in range(2):
+        shown = hidden(scene, rng.uniform(0.2, 0.6), rng) if rng.uniform() < 0.5 else scene
+        if rng.uniform() < 0.3:
+            shown = _noisy(shown, rng.uniform(0.5, 2.0), rng)
+        yield _Asked(shown, None, {})
+        yield _Asked(shown, None, EVIDENCE[rng.integers(len(EVIDENCE))], rng.uniform() < 0.5)
+
+
+def _noisy(scene: Scene, std_mm: float, rng: Generator) -> Scene:
+    """Along each point's ray."""
+    points = scene.cloud.points_mm
+    away = 1 + rng.normal(0, std_mm, len(points)) / np.linalg.norm(points, axis=1)
+    return replace(scene, cloud=SensorCloud((points * away[:, None]).astype(np.float32)))
+
+
+def _misses(
+    found: Estimate, scene: Scene, model: RegistrationModel
+) -> Iterator[tuple[str, float, float]]:
+    """Of each part, of all its points and of its centre, mm: at the surface extrapolated from the
+    inner points, whose true places are known."""
+    assert scene.targets is not None
+    assert found.motion is not None
+    targets = scene.targets
+    off_mm = found.motion.carry(targets.points_ct) - targets.points_mm
+    at = RBFInterpolator(targets.points_ct, off_mm, kernel="linear", degree=1)
+    for label, part in enumerate(model.shape.anatomy_ct.parts, start=1):
+        mine, name = targets.labels == label, model.parts[label - 1]
+        if label == 1:
+            mine = np.ones(len(mine), bool)
+        if mine.any():
+            vertices = part.vertices_mm[:: len(part.vertices_mm) // _VERTICES + 1]
+            largest_mm = np.linalg.norm(at(vertices), axis=1).max()
+            yield name, float(largest_mm), float(np.linalg.norm(off_mm[mine].mean(0)))
+
+
+def _rigid_misses(model: RegistrationModel, scene: Scene) -> dict[str, float]:
+    """Of the tumors' centres, by a rigid fit to the same points from the best rigid pose."""
+    assert scene.targets is not None
+    start, _ = best_rigid_pose(model.shape.anatomy_ct, scene)
+    rigid = rigid_fit(model.shape.distances[0], scene.cloud, start)
+    off_mm = transform_points(rigid, scene.targets.points_ct) - scene.targets.points_mm
+    return {
+        name: float(np.linalg.norm(off_mm[scene.targets.labels == label].mean(0)))
+        for label, name in enumerate(model.parts, start=1)
+        if (scene.targets.labels == label).any()
+    }
+
+
+def learned(rows: pd.DataFrame, about: dict[str, Any]) -> BoundModel:
+    """Of tumors and organs."""
+    tumor = rows.part.map(is_tumor)
+    quantiles = [quantile_of(rows[mine]) for mine in (tumor, ~tumor)]
+    return BoundModel(fingerprint(), *quantiles, {**about, "answers": len(rows)})
+
+
+def quantile_of(rows: pd.DataFrame) -> Quantile:
+    """The weights of the least pinball loss, then the constant under which 95 % of the misses lie
+    within the bound, each family of physics counting alike: of answers that nothing else speaks
+    against."""
+    calm = rows[_acceptable(rows) & (rows.miss_mm < _LOST_MM)]
+    names = [name for name in rows.columns if name not in _ABOUT]
+    knots = [(name, float(k)) for name in names for k in np.unique(calm[name].quantile(_KNOTS))]
+    values = np.column_stack([(calm[name] - knot).clip(lower=0) for name, knot in knots])
+    misses_mm = calm.miss_mm.clip(lower=_LEAST_MM).to_numpy()
+    share = (1 / calm.groupby("family").miss_mm.transform("size")).to_numpy()
+    share = share / share.sum()
+
+    def loss(unknowns: Float[np.ndarray, " w"]) -> tuple[float, Float[np.ndarray, " w"]]:
+        bounds_mm = np.exp(np.minimum(unknowns[0] + values @ unknowns[1:], 5.0))
+        over = (misses_mm - bounds_mm) / _SMOOTH_MM
+        steep = 1 / (1 + np.exp(-np.clip(over, -50, 50)))
+        pinball = (_CONFIDENCE - 1) * over + np.logaddexp(0, np.clip(over, -700, 700))
+        slope = -share * bounds_mm * (_CONFIDENCE - 1 + steep)
+        gradient = np.append(slope.sum(), values.T @ slope + 2 * _RIDGE * unknowns[1:])
+        return float(share @ pinball * _SMOOTH_MM + _RIDGE * (unknowns[1:] ** 2).sum()), gradient
+
+    first = np.append(np.log(np.quantile(misses_mm, _CONFIDENCE)), np.zeros(len(knots)))
+    limits = [(None, None), *[(0.0, None)] * len(knots)]
+    best = minimize(loss, first, jac=True, bounds=limits, method="L-BFGS-B").x
+    left = np.log(misses_mm) - values @ best[1:]
+    constant = _weighted_quantile(left, share)
+    hinges: dict[str, list[tuple[float, float]]] = {}
+    for (name, knot), weight in zip(knots, best[1:], strict=True):
+        if weight > 1e-4:
+            hinges.setdefault(name, []).append((round(knot, 4), round(float(weight), 4)))
+    kept = {name: tuple(each) for name, each in hinges.items()}
+    return Quantile(round(constant, 4), kept)
+
+
+def _weighted_quantile(values: np.ndarray, share: np.ndarray) -> float:
+    order = np.argsort(values)
+    below = np.cumsum(share[order])
+    rank = min(int(np.searchsorted(below, _CONFIDENCE * (1 + 1 / len(values)))), len(values) - 1)
+    return float(values[order][rank])
+
+
+def left_out(rows: pd.DataFrame, part: str, by: str | None = None) -> pd.DataFrame:
+    """What it says of each organ, family of physics or kind of evidence when it was learned from
+    the others: a line for each, or of ``by``. An answer is good if that holds for all its
+    tumors."""
+    tumors = rows[rows.part.map(is_tumor)].assign(bound_mm=np.nan)
+    for name in tumors[part].unique():
+        mine = tumors[part] == name
+        model = quantile_of(tumors[~mine])
+        each = tumors[mine][[*model.hinges]].to_dict("records")
+        tumors.loc[mine, "bound_mm"] = [model.bound_mm(known) for known in each]
+    near = _acceptable(tumors) & (tumors.bound_mm <= POOR_MM)
+    good = near.groupby([tumors[name] for name in _ANSWER]).transform("all")
+    lines = []
+    for name, some in [*tumors.groupby(by or part), ("all", tumors)]:
+        calm, mine = some[_acceptable(some)], some[good[some.index]]
+        lines.append({
+            by or part: name,
+            "answers": len(some),
+            "good %": round(100 * len(mine) / len(some)),
+            "center of good, mm: median": round(mine.center_mm.median(), 1),
+            "95 %": round(mine.center_mm.quantile(0.95), 1),
+            "worst": round(mine.center_mm.max(), 1),
+            "rigid fit: median": round(mine.rigid_fit_mm.median(), 1),
+            "its 95 %": round(mine.rigid_fit_mm.quantile(0.95), 1),
+            "center over 5 mm": int((mine.center_mm > FAR_MM).sum()),
+            "within the bound %": round(100 * (calm.miss_mm <= calm.bound_mm).mean(), 1),
+            "bound, median": round(calm.bound_mm.median(), 1),
+            "rank correlation": round(spearmanr(calm.miss_mm, calm.bound_mm)[0], 2),
+        })  # fmt: skip
+    return pd.DataFrame(lines)
+
+
+def _acceptable(rows: pd.DataFrame) -> pd.Series:
+    """Whether nothing but what was learned speaks against an answer."""
+    return rows.finding.isna() | rows.finding.isin(FAR_OFF)
