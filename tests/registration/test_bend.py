@@ -9,16 +9,19 @@ import numpy as np
 import pytest
 
 from elastic_objects import CENTER, RADII
+from tumortrack.core.evidence import Landmark, Touch
 from tumortrack.registration import bend as module
 from tumortrack.registration.bend import (
     _grouped,
     _Groups,
+    _Linear,
     _means_of_groups,
     _precision_of_forces,
     _with_compliance,
     bend,
 )
 from tumortrack.registration.config import GaussNewtonConfig
+from tumortrack.registration.evidence import EvidenceTerms
 from tumortrack.registration.gauss_newton import GaussNewton, prior_precision, refine
 from tumortrack.registration.kernels import POSE
 from tumortrack.registration.looks import Looks, Residuals
@@ -155,26 +158,43 @@ def test_the_evidence_is_that_of_all_unknowns(std_mm, monkeypatch):
     assert cost == pytest.approx(expected, rel=1e-3)
 
 
-def test_what_neighbours_share_is_marginalised():
-    """As if it were unknown."""
+def test_what_neighbours_and_tools_share_is_as_if_it_were_unknown():
     fit = refined(seen(pressed(1)), START, CONFIG)
-    start = _with_compliance(fit.motion)
-    near, error = fit.looks.residuals(start, CONFIG), start.shape.model_error
-    node, count = error.nearest(start.back(fit.looks.points_mm)), len(error.nodes_ct)
-    rows = np.concatenate([near.by_motion, np.eye(count)[node]], axis=1)
-    whole = rows.T @ (rows * near.weights[:, None])
-    whole[-count:, -count:] += error.precision / 0.7**2
-    slope, own = rows.T @ (near.weights * near.distances_mm), len(whole) - count
-    curvature, gradient = whole[:own, :own].copy(), slope[:own].copy()
-    weighted_mm = near.weights * near.distances_mm
-    error.marginalise(
-        curvature, gradient, node, near.by_motion, weighted_mm, near.weights, scale=0.7
+    start, scale = _with_compliance(fit.motion), 0.7
+    how = {"std_mm": 0.8, "shared_std_mm": 1.5}
+    touches = [Touch(place_mm=tuple(p), tool="a", **how) for p in PLACES[FACING < -0.2][::300]]
+    inner = CENTER + [5.0, 0, 3]
+    touches.append(
+        Landmark(point_ct=tuple(inner), place_mm=tuple(start.carry(inner[None])[0]), **how)
     )
-    ridge = np.eye(len(whole))
-    ridge[own:, own:] = 0
-    step = np.linalg.solve(whole + ridge, slope)[:own]
+    evidence = EvidenceTerms.of(touches, ("kidney", "tumor_1"))
+    looks = replace(fit.looks, evidence=evidence)
+    near, terms = looks.residuals(start, CONFIG), evidence.at(start)
+    count = near.by_motion.shape[1]
+    precision = np.eye(count)
+    at = _Linear.at(start, fit.moved, near, looks, precision, terms, scale)
+    error = start.shape.model_error
+    places = np.concatenate([looks.points_mm, evidence.places_mm])
+    field = np.eye(len(error.nodes_ct))[error.nearest(start.back(places))]
+    nodes, tools, points = field.shape[1], terms.by_shifts.shape[1], len(looks.points_mm)
+    shifts = np.concatenate([np.zeros((points, tools)), terms.by_shifts])
+    rows = np.concatenate([near.by_motion, terms.by_motion])
+    every = np.zeros((len(rows), count + nodes + tools))
+    every[:, :count], every[:, count + nodes :] = rows, shifts
+    every[: len(field), count : count + nodes] = field  # a landmark lies on no surface
+    weights = np.append(near.weights, terms.weights)
+    whole = every.T @ (every * weights[:, None])
+    whole[:count, :count] += precision
+    whole[count : count + nodes, count : count + nodes] += error.precision / scale**2
+    whole[count + nodes :, count + nodes :] += np.eye(tools)
+    inverse = np.linalg.inv(whole)[:count, :count]
+    np.testing.assert_allclose(np.linalg.inv(at.curvature), inverse, rtol=1e-5, atol=1e-8)
+    off_mm = np.append(near.distances_mm, terms.residuals_mm)
+    slope = every.T @ (weights * off_mm)
+    slope[:count] += np.append(fit.moved, start.coefficients - start.shape.body.mean)
+    step = np.linalg.solve(whole, slope)[:count]
     np.testing.assert_allclose(
-        np.linalg.solve(curvature + np.eye(own), gradient), step, rtol=1e-6, atol=1e-9
+        np.linalg.solve(at.curvature, at.gradient), step, rtol=1e-4, atol=1e-7
     )
 
 

@@ -101,9 +101,9 @@ class PartReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     """One part, camera frame. ``points``: of the labelled cloud, with their mean ``probability``;
     ``center_axes``: unit vectors along which the centre has the deviations
     ``center_axes_std_mm``, the least sure first; ``nearest_mm``: from the centre to the nearest
-    point that was seen or known; ``held_by_prior_mm``: how far the elastic prior, against the points, holds
-    the centre; ``fit_std_mm``: the largest deviations of centre and surface without the camera's
-    common error. None: not found, or the method does not know."""
+    point that was seen or is known; ``held_by_prior_mm``: how far the elastic prior, against the
+    points, holds the centre; ``fit_std_mm``: the largest deviations of centre and surface without
+    the camera's common error. None: not found, or the method does not know."""
 
     label: int
     found: bool

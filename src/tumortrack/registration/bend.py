@@ -149,25 +149,36 @@ class _Linear:
     ) -> _Linear:
         """``near``, ``terms``: of the looks' points and evidence, there; ``scale``: of the model's
         error."""
-        rows = np.concatenate([near.by_motion, near.by_cameras], axis=1)
-        off_mm, weights, places_mm = near.distances_mm, near.weights, looks.points_mm
-        count, cameras = len(precision), rows.shape[1] - len(precision)
-        errors = np.diag(np.tile(CAMERA_STD**-2, cameras // POSE))
-        change = np.append(moved, motion.coefficients - motion.shape.body.mean)
-        curvature = _blocks(precision, errors) + rows.T @ (rows * weights[:, None])
-        gradient = rows.T @ (weights * off_mm)
-        gradient[:count] += precision @ change
+        by_all = np.concatenate([near.by_motion, near.by_cameras], axis=1)
+        count, cameras = len(precision), by_all.shape[1] - len(precision)
+        rows = np.column_stack([by_all, near.distances_mm])
+        weights, places_mm = near.weights, looks.points_mm
+        whole = rows.T @ (rows * weights[:, None])
+        by_shifts, error = np.zeros((len(rows), 0)), motion.shape.model_error
         if terms is not None and looks.evidence is not None:
-            terms.add_to(curvature[:count, :count], gradient[:count])
+            more = np.pad(terms.by_motion, ((0, 0), (0, cameras)))
+            more = np.column_stack([more, terms.residuals_mm])
+            whole += more.T @ (more * terms.weights[:, None])
             on = looks.evidence.on_organ
-            of_places = np.pad(terms.by_motion[on], ((0, 0), (0, cameras)))
-            rows = np.concatenate([rows, of_places])
-            off_mm = np.append(off_mm, terms.residuals_mm[on])
-            weights = np.append(weights, terms.weights[on])
+            rows, weights = np.concatenate([rows, more[on]]), np.append(weights, terms.weights[on])
             places_mm = np.concatenate([places_mm, looks.evidence.places_mm[on]])
-        error = motion.shape.model_error
+            by_shifts = np.concatenate([np.zeros((len(near.weights), terms.by_shifts.shape[1])),
+                                        terms.by_shifts[on]])  # fmt: skip
         node = error.nearest(motion.back(places_mm))
-        error.marginalise(curvature, gradient, node, rows, weights * off_mm, weights, scale)
+        together = np.column_stack([rows, by_shifts])
+        own, across = error.equations(node, together, weights, scale)
+        if terms is not None:  # tools' shifts are marginalised with the field
+            shifts = terms.by_shifts.T * terms.weights
+            mixed = across[:, rows.shape[1] :]
+            own = np.block(
+                [[own, mixed], [mixed.T, np.eye(len(shifts)) + shifts @ terms.by_shifts]]
+            )
+            across = np.concatenate([across[:, : rows.shape[1]], shifts @ more])
+        whole -= across.T @ np.linalg.solve(own, across)
+        errors = np.diag(np.tile(CAMERA_STD**-2, cameras // POSE))
+        curvature, gradient = whole[:-1, :-1] + _blocks(precision, errors), whole[:-1, -1]
+        change = np.append(moved, motion.coefficients - motion.shape.body.mean)
+        gradient[:count] += precision @ change
         return cls(motion, moved, near.distances_mm, terms, curvature, gradient)
 
     def moved_by(

@@ -48,29 +48,22 @@ class ModelError:
         nodes = self.nodes_ct
         return ((nodes**2).sum(1) / 2 - points_ct @ nodes.T).argmin(1)
 
-    def marginalise(
+    def equations(
         self,
-        curvature: Float64[np.ndarray, "p p"],
-        gradient: Float64[np.ndarray, " p"],
         node: Int64[np.ndarray, " n"],
-        by_motion: Float[np.ndarray, "n p"],
-        weighted_mm: Float64[np.ndarray, " n"],
+        rows: Float[np.ndarray, "n q"],
         weights: Float64[np.ndarray, " n"],
         scale: float = 1.0,
-    ) -> None:
-        """Take the field out of a Gauss-Newton step's equations (Schur complement): of rows with
-        these ``weights``, whose residuals times these are ``weighted_mm``, if the field is so many
-        times as large."""
+    ) -> tuple[Float64[np.ndarray, "k k"], Float64[np.ndarray, "k q"]]:
+        """Of the field, if it is so many times as large, in a Gauss-Newton step: its own curvature,
+        and that with ``rows``, each of the node that errs with it."""
         count = len(self.nodes_ct)
         order = np.argsort(node, kind="stable")
         used, first = np.unique(node[order], return_index=True)
-        across = np.zeros((count, len(gradient) + 1))
-        rows = np.column_stack([by_motion * weights[:, None], weighted_mm])[order]
-        across[used] = np.add.reduceat(rows, first)
+        across = np.zeros((count, rows.shape[1]))
+        across[used] = np.add.reduceat((rows * weights[:, None])[order], first)
         own = self.precision / scale**2 + np.diag(np.bincount(node, weights, count))
-        taken = across[:, :-1].T @ np.linalg.solve(own, across)
-        curvature -= taken[:, :-1]
-        gradient -= taken[:, -1]
+        return own, across
 
 
 def covariance_mm2(points_ct: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n n"]:
