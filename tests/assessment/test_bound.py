@@ -48,7 +48,7 @@ def test_the_page_says_of_which_method_the_shipped_model_is_unless_it_is_of_this
 
 def of_radius(radius_mm):
     every = Quantile(math.log(radius_mm), {})
-    return BoundModel(fingerprint(), every, every, {})
+    return BoundModel(fingerprint(), every, every, {"touch": 1.0}, {})
 
 
 @pytest.mark.parametrize("part", ["tumor_1", "kidney"])

@@ -77,7 +77,7 @@ class Beside:
         places_mm = transform_points(pose, motion.carry(self._points_ct))
         touches = []
         for rank, (advice, place_mm) in enumerate(zip(self._advice, places_mm, strict=True), 1):
-            falls = f"{advice.std_mm:.1f} -> {advice.then_std_mm:.1f} mm"
+            falls = f"{advice.bound_mm:.1f} -> {advice.then_bound_mm:.1f} mm"
             x, y, z = place_mm
             words = f"touch the organ at {x:.0f}, {y:.0f}, {z:.0f} mm: {advice.part} {falls}"
             touches.append(NextTouch(place_mm, f"{rank}: {falls}", words))

@@ -16,7 +16,7 @@ from typing import Any
 
 from tumortrack.core.assessment import ErrorBound
 from tumortrack.core.config import Config, from_builtins
-from tumortrack.core.report import FitReport
+from tumortrack.core.report import FitReport, NextEvidence
 
 _NAME = "bounds.json"
 # An answer is poor from this bound on. docs/trust.md has what that is worth for organs, families
@@ -45,11 +45,13 @@ class Quantile(Config, frozen=True):
 
 
 class BoundModel(Config, frozen=True):
-    """``fingerprint``: of the method that it was learned with; ``about``: on what."""
+    """``fingerprint``: of the method that it was learned with; ``advice``: by kind of evidence, how
+    much a bound fell over what was foreseen, in scenes left out; ``about``: on what."""
 
     fingerprint: str
     tumor: Quantile
     organ: Quantile
+    advice: dict[str, float]
     about: dict[str, Any]
 
 
@@ -90,6 +92,18 @@ def depths_within_mm(report: FitReport, name: str) -> float:
     if report.motion is None or center_mm is None:
         return 0.0
     return _WITHIN * report.motion.depth_share * math.hypot(*center_mm)
+
+
+def foreseen_mm(report: FitReport, advice: NextEvidence) -> float | None:
+    """The bound of the part that a piece of evidence is for, once that is known, without a factor;
+    None: not known. What it does not narrow stays."""
+    known = figures(report, advice.part)
+    if known is None or advice.part not in report.tumors:
+        return None
+    less = math.log(advice.then_std_mm / advice.std_mm)
+    then = {name: known[name] + less for name in ("center_std", "surface_std")}
+    bound_mm = shipped().tumor.bound_mm({**known, **then})
+    return math.hypot(bound_mm, depths_within_mm(report, advice.part))
 
 
 def bounds_of(report: FitReport) -> dict[str, ErrorBound]:

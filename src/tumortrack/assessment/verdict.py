@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool
 
+from tumortrack.assessment.advice import worthwhile
 from tumortrack.assessment.bound import POOR_MM, bounds_of, depths_within_mm
 from tumortrack.core.assessment import ErrorBound
 from tumortrack.core.errors import NotThisOrgan
@@ -80,7 +81,7 @@ def judged(
     for (organ, seen), look in zip(views, looks, strict=False):  # a network takes the first alone
         if isinstance(seen, DepthFrame):
             images.append(seen_through(organ, seen, _behind_mm(look)))
-        else:
+        elif len(seen.points_mm):  # touches alone hide nothing, and are no scan
             clouds.append(cloud_shares(organ, seen, _behind_mm(look)))
     unseen = max((share for _, share in clouds), default=0.0)
     rim_share = min((share for _, share, _ in images), default=0.0) if not clouds else 0.0
@@ -101,7 +102,9 @@ def judged(
         finding = Finding("seen_through", {"percent": 100 * through})
     elif unseen > _MAX_UNSEEN and finding is None and not _deciding(report, bounds):
         finding = Finding("unseen", {"percent": 100 * unseen})
-    return estimate.assessed(bounds=bounds, factor=factor, finding=finding).reporting(
+    advice = worthwhile(report, estimate.assessment.next_evidence, factor)
+    told = {"bounds": bounds, "factor": factor, "finding": finding, "next_evidence": advice}
+    return estimate.assessed(**told).reporting(
         unseen=report.unseen,
         seen_through=through,
         in_sight=in_sight,

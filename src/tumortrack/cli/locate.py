@@ -82,7 +82,7 @@ class Locate(LocateOptions):
 def _say_estimate(estimate: Estimate, located: Located) -> None:
     """The verdict, and where each part is."""
     from tumortrack.core.estimate import verdict_words
-    from tumortrack.report.seen import next_lines, part_rows, row_words
+    from tumortrack.report.seen import alternative_lines, next_lines, part_rows, row_words
 
     report = estimate.report
     say(verdict_words(estimate.quality, estimate.reason))
@@ -91,6 +91,8 @@ def _say_estimate(estimate: Estimate, located: Located) -> None:
         say(row_words(row))
     for number, each in enumerate(report.evidence, start=1):
         say(f"{each.name} {number}: {each.off_mm:.1f} mm off{', left out' * each.left_out}")
+    for line in alternative_lines(estimate):
+        say(line)
     for line in next_lines(estimate):
         say(line)
     for view in located.about["input"]:

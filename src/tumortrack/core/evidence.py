@@ -220,10 +220,12 @@ def _cells(row: dict[str, str], where: str) -> dict[str, Any]:
     }
 
 
-def touched(evidence: Sequence[Evidence], organ: str) -> tuple[SensorCloud, tuple[Evidence, ...]]:
+def touched(
+    evidence: Sequence[Evidence], organ: str
+) -> tuple[SensorCloud, tuple[Evidence, ...], tuple[Evidence, ...]]:
     """Where the organ's surface was touched or outlined, as a cloud that no camera saw, with the
-    noise that is stated; and the rest. A tip's radius is taken off towards the middle of all
-    places. Raises InputError: there are too few."""
+    noise that is stated; the pieces of which it is; and the rest. A tip's radius is taken off
+    towards the middle of all places. Raises InputError: there are too few."""
     mine = [each for each in evidence
             if isinstance(each, Touch | Outline) and each.part in ("", organ)]  # fmt: skip
     counts = [len(each.places) for each in mine]
@@ -245,7 +247,7 @@ def touched(evidence: Sequence[Evidence], organ: str) -> tuple[SensorCloud, tupl
     mean_mm = float(np.linalg.norm([std_mm / count**0.5, *shared.values()]))
     noise = PointNoise(std_mm, std_mm, mean_mm)
     cloud = SensorCloud(places_mm.astype(np.float32), noise=noise, depth_error=DepthError())
-    return cloud, tuple(each for each in evidence if each not in mine)
+    return cloud, tuple(mine), tuple(each for each in evidence if each not in mine)
 
 
 def evidence_json(evidence: tuple[Evidence, ...]) -> bytes:

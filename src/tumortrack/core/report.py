@@ -129,10 +129,20 @@ class Residuals(_Value, frozen=True, kw_only=True):
 
 
 class RivalFit(_Value, frozen=True, kw_only=True):
-    """Another fit, which costs ``more``; ``apart_mm``: how far off the parts' middles lie in it."""
+    """Another fit, which costs ``more``; ``apart_mm``: how far off the parts' middles lie in it, at
+    ``center_mm``, with the organ turned by so much."""
 
     more: float
     apart_mm: dict[str, float]
+    center_mm: dict[str, Point] = {}
+    turn_degrees: float = 0.0
+
+    @property
+    def words(self) -> str:
+        places = (
+            f"{n} at ({x:.1f}, {y:.1f}, {z:.1f}) mm" for n, (x, y, z) in self.center_mm.items()
+        )
+        return f"as likely, turned by {self.turn_degrees:.0f} degrees: {', '.join(places)}"
 
 
 class ExcludedFit(_Value, frozen=True, kw_only=True):
@@ -196,9 +206,9 @@ class EvidenceReport(_Value, frozen=True, kw_only=True):
 
 class NextEvidence(_Value, frozen=True, kw_only=True):
     """What to learn next of a part, and what one standard deviation of its middle along its least
-    sure axis is and would be ``then``. ``place_mm`` and ``direction`` (unit), by kind: of a touch
-    on the organ, with the surface's normal; an outline's middle, with its plane's normal; a
-    landmark (``name``: the structure); a look: the camera's place and line of sight."""
+    sure axis, and its bound, are and would be ``then``. ``place_mm`` and ``direction`` (unit), by
+    kind: of a touch on the organ, with the surface's normal; an outline's middle, with its plane's
+    normal; a landmark (``name``: the structure); a look: the camera's place and line of sight."""
 
     kind: Literal["touch", "outline", "landmark", "look"]
     part: str
@@ -206,6 +216,8 @@ class NextEvidence(_Value, frozen=True, kw_only=True):
     direction: Point
     std_mm: float
     then_std_mm: float
+    bound_mm: float = 0.0
+    then_bound_mm: float = 0.0
     name: str = ""
 
     @property
@@ -218,7 +230,8 @@ class NextEvidence(_Value, frozen=True, kw_only=True):
             "landmark": f"point at {self.name}",
             "look": f"look from {x}, {y}, {z} mm as well",
         }[self.kind]
-        return f"{what}: {self.part} {self.std_mm:.1f} -> {self.then_std_mm:.1f} mm"
+        bounds = f"{self.then_bound_mm:.1f} mm instead of {self.bound_mm:.1f}"
+        return f"{what}: {self.part} would be off by at most {bounds} (95 %)"
 
 
 class AllowedPoses(_Value, frozen=True, kw_only=True):

@@ -25,7 +25,7 @@ def cost_entry(
         far = np.abs(fit.distances_mm) > FARTHEST * looks.width_mm(config)
         strays = max(float(far[looks.look == n].mean()) for n in range(looks.count))
     rivals = [
-        RivalFit(more=rival.cost - fit.cost, apart_mm=_middles_apart_mm(fit.motion, rival.motion))
+        RivalFit(more=rival.cost - fit.cost, **_beside(fit.motion, rival.motion))
         for rival in fit.rivals
     ]
     return FitCost(
@@ -38,12 +38,18 @@ def cost_entry(
     )
 
 
-def _middles_apart_mm(motion: ElasticMotion, rival: ElasticMotion) -> dict[str, float]:
-    """How far from each other the middles of the parts lie."""
-    middles_ct = motion.shape.middles_ct
-    away = rival.carry(middles_ct) - motion.carry(middles_ct)
-    apart_mm = np.linalg.norm(away, axis=1).tolist()
-    return dict(zip(motion.shape.anatomy_ct.names, apart_mm, strict=True))
+def _beside(motion: ElasticMotion, rival: ElasticMotion) -> dict[str, Any]:
+    """Where the middles of the parts lie in another motion, how far from this one's, and by how
+    much the organ is turned."""
+    middles_ct, names = motion.shape.middles_ct, motion.shape.anatomy_ct.names
+    there = rival.carry(middles_ct)
+    apart_mm = np.linalg.norm(there - motion.carry(middles_ct), axis=1).tolist()
+    cosine = (np.trace(rival.rotation @ motion.rotation.T) - 1) / 2
+    return {
+        "apart_mm": dict(zip(names, apart_mm, strict=True)),
+        "center_mm": dict(zip(names, map(tuple, there.tolist()), strict=True)),
+        "turn_degrees": float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
+    }
 
 
 def _excluded(fit: RegistrationResult, prior: PosePrior) -> ExcludedFit | None:

@@ -29,7 +29,7 @@ from tumortrack.core.report import Point
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
 from tumortrack.report.renderer import Body, ParallelView, corner_normals, render, rgb
-from tumortrack.report.seen import PAGE, Seen, next_evidence, next_lines, part_rows, row_words
+from tumortrack.report.seen import PAGE, Seen, alternative_lines, next_evidence, next_lines, part_rows, row_words
 from tumortrack.report.wrapping import wrapped
 from tumortrack.sense.camera import deproject
 from tumortrack.sense.region.working_image import ORGAN, sampled_pixels
@@ -99,7 +99,7 @@ def _lines(report: dict[str, Any], estimate: Estimate | None) -> Iterator[str]:
         yield f"{_sentence(estimate.assessment.factor_words)}."
     yield from (view["words"] for view in report.get("input", ()))
     yield from (f"Note: {note}" for note in report.get("notes", ()))
-    yield from map(_sentence, next_lines(estimate))
+    yield from map(_sentence, (*alternative_lines(estimate), *next_lines(estimate)))
     if estimate is not None and any(_spots(estimate)):
         yield "Dots: white, evidence in use; red, left out; blue, the best places to touch next."
 

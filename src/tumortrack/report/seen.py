@@ -51,6 +51,12 @@ def part_rows(report: FitReport, assessment: Assessment) -> list[dict[str, str]]
     return rows
 
 
+def alternative_lines(estimate: Estimate | None) -> list[str]:
+    """Other places that the points allow as well, which put a tumor elsewhere."""
+    cost = None if estimate is None else estimate.report.fit_cost
+    return [other.words for other in (() if cost is None else cost.others)]
+
+
 def next_evidence(estimate: Estimate | None) -> tuple[NextEvidence, ...]:
     """What to learn next; nothing of an answer that may be another organ, or in another place."""
     if estimate is None or (estimate.finding is not None and estimate.finding.kind not in FAR_OFF):
@@ -59,10 +65,10 @@ def next_evidence(estimate: Estimate | None) -> tuple[NextEvidence, ...]:
 
 
 def next_lines(estimate: Estimate | None) -> list[str]:
-    """The same in words, the best first, without touches that count on the first one."""
+    """The same in words: the best alone."""
     every = next_evidence(estimate)
-    firsts = sorted([*every[:1], *every[3:]], key=lambda each: each.then_std_mm)
-    return [f"next, {each.words} (one deviation; camera frame)" for each in firsts]
+    best = min(every, key=lambda each: each.then_bound_mm, default=None)
+    return [] if best is None else [f"next, {best.words}"]
 
 
 def row_words(row: dict[str, str]) -> str:

@@ -28,6 +28,7 @@ from tumortrack.imaging.case import Case
 from tumortrack.models.folder import weakness_of
 from tumortrack.models.method import Locator, method_of_config
 from tumortrack.models.model import Model
+from tumortrack.registration.evidence import EvidenceTerms
 from tumortrack.registration.locator import RegistrationLocator
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion, seen_from_first
@@ -116,7 +117,8 @@ class Tracker:
             looks = (Look(replace(alone, stamp_ns=cloud.stamp_ns), cloud, HERE),)
 
         def located(looks: Sequence[Look]) -> Estimate:
-            return self._judged(self._locator.locate(looks, grid, seed, pieces), looks, False)
+            found = self._locator.locate(looks, grid, seed, pieces)
+            return self._judged(_told(found, shown), looks, False)
 
         with self._explaining_errors(looks, _DEFAULTS, bool(pieces)):
             estimate, looks = likeliest_piece(looks, located)
@@ -210,6 +212,17 @@ class Tracker:
     def warm(self) -> None:
         """Load and compile what the first call of ``follow`` would otherwise wait for."""
         self._locator.warm()
+
+
+def _told(estimate: Estimate, shown: Sequence[Evidence]) -> Estimate:
+    """The estimate with what it says of evidence that was its cloud."""
+    motion = estimate.motion
+    if not shown or not isinstance(motion, ElasticMotion):
+        return estimate
+    terms = EvidenceTerms.of(shown, motion.shape.anatomy_ct.names)
+    assert terms is not None
+    told = terms.described(shown, motion, 0, terms.at(motion))
+    return estimate.reporting(evidence=(*told, *estimate.report.evidence))
 
 
 def _parted(

@@ -145,7 +145,8 @@ def learned(rows: pd.DataFrame, about: dict[str, Any]) -> BoundModel:
     """Of tumors and organs."""
     tumor = rows.part.map(is_tumor)
     quantiles = [quantile_of(rows[mine]) for mine in (tumor, ~tumor)]
-    return BoundModel(fingerprint(), *quantiles, {**about, "answers": len(rows)})
+    advice = about.pop("advice", {})
+    return BoundModel(fingerprint(), *quantiles, advice, {**about, "answers": len(rows)})
 
 
 def quantile_of(rows: pd.DataFrame) -> Quantile:
