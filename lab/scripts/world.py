@@ -67,7 +67,7 @@ class Options:
     model: Path | None = None
     """Measure it (a case has one)."""
     plans: Path | None = None
-    """Instead: plan on the estimates of this one, which was calibrated on other states, and cut."""
+    """Instead: plan on the estimates of this one, and cut."""
     beside: tuple[Path, ...] = ()
     """Other organs' scenes that are measured already: they join the tables."""
     document: Path | None = None
@@ -127,7 +127,7 @@ def _estimates(options: Options, world: World, model: Path, made: list[str]) -> 
 def _plans(options: Options, world: World, model: Path, made: list[str]) -> Made:
     """Plans are kept in the scenes' folder, a file a scene and method."""
     case, rows = study_case(options.out.name, options.case, options.out), []
-    for name, method in product(made, (resection.calibrated(model), resection.truth())):
+    for name, method in product(made, (resection.tracked(model), resection.truth())):
         variant, _, view = name.rpartition("-")
         about = case, method, [variant], view, 160, options.out / "plans" / name
         rows += measured(*about, resection.cut_one, **resection.cutting())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -57,8 +57,7 @@ def moved(anatomy, b_from_a):
 
 
 def located_as_it_is(anatomy):
-    estimate = scattered(estimate_of(Fit(lambda points: points), anatomy))
-    return of_estimate(estimate, unsure=False)
+    return of_estimate(scattered(estimate_of(Fit(lambda points: points), anatomy)))
 
 
 def test_a_plan_on_the_truth_takes_the_tumor_with_the_margin_that_was_asked_for():
@@ -75,8 +74,9 @@ def test_a_plan_on_the_truth_takes_the_tumor_with_the_margin_that_was_asked_for(
         assert result.kerf_ml == pytest.approx(plan.volumes_ml["kerf"], rel=0.2)
 
 
-def shifted(shift_mm=0.0, std_mm=None, nothing=False, name="clinic", calls=None):
-    """Answers the truth, shifted along the table's x, and says how sure it is if it is told."""
+def shifted(shift_mm=0.0, bound_mm=None, nothing=False, name="clinic", calls=None):
+    """Answers the truth, shifted along the table's x; good, with a bound of tumor_1, if it is told
+    one."""
 
     def locate(scene, grid):
         if calls is not None:
@@ -85,28 +85,9 @@ def shifted(shift_mm=0.0, std_mm=None, nothing=False, name="clinic", calls=None)
             raise NoEstimate("the cloud shows no organ")
         carry = rigid_carry(rigid(np.eye(3), np.array([shift_mm, 0.0, 0.0])))
         estimate = scattered(estimate_of(Fit(carry), scene.reference, grid=grid))
-        return replace(estimate, motion=None if std_mm is None else Sure(std_mm))
+        return estimate if bound_mm is None else bounded(estimate, tumor_1=bound_mm)
 
     return Method(name, {"shift_mm": shift_mm}, locate)
-
-
-@dataclass(frozen=True)
-class Sure:
-    std: float
-
-    def carry(self, points_ct, /):
-        return points_ct
-
-    def back(self, points_camera, /):
-        return points_camera
-
-    def std_mm(self, points_ct, /):
-        return np.full(len(points_ct), self.std)
-
-    largest_std_mm = std_mm
-
-    def covariance_mm2(self, points_ct, /):
-        return self.std**2 * np.tile(np.eye(3), (len(points_ct), 1, 1))
 
 
 @pytest.fixture(scope="module")
@@ -144,42 +125,30 @@ def test_an_estimate_that_is_off_costs_up_to_as_much_margin(case):
     )
 
 
-def test_the_margin_grows_by_what_the_estimate_is_unsure_of(case):
-    plans = cuts(case, shifted(std_mm=0.5))
-    assert list(plans) == [planner.name for planner in PLANNERS]
-    wider = Planner(sigmas=2.0)
-    gained = plans[wider.name]["margin_mm"] - plans[OURS.name]["margin_mm"]
-    assert gained == pytest.approx(1.0, abs=0.3)
-    assert plans[wider.name]["healthy_ml"] > plans[OURS.name]["healthy_ml"] + 0.2
-    without = cuts(case, shifted())
-    assert list(without) == [OURS.name]
-
-
-def test_a_stated_margin_pays_for_an_estimate_that_is_as_far_off(case):
+def test_a_margin_with_the_errors_pays_for_an_estimate_that_is_as_far_off(case):
     """3 mm of it, with 2 mm of hand-eye, 3 of tool and 2 of motion as nobody states them."""
-    off, radius_mm = shifted(shift_mm=3.0, std_mm=0.5), 3.0
-
-    def locate(scene, grid):
-        return bounded(off.locate(scene, grid), tumor_1=radius_mm)
-
-    rows = cut_one(case, replace(off, locate=locate), "D0", "noise", 64)
+    rows = cut_one(case, shifted(shift_mm=3.0, bound_mm=3.0), "D0", "noise", 64)
     assert all(row["good"] for row in rows)
-    assert [row["planner"] for row in rows] == [planner.name for planner in PLANNERS]
-    plain_mm, _, radius, everything, thin = (row["margin_mm"] for row in rows)
-    others_mm = 2.0 + np.hypot(radius_mm, np.hypot(2, 3))
-    asked = (plain_mm, 5.0), (radius, 8.0), (everything, 5.0 + others_mm), (thin, 1.0 + others_mm)
-    for kept_mm, asked_mm in asked:
+    assert [row["planner"] for row in rows] == ["5 mm", "5 mm + errors"]
+    plain_mm, with_errors_mm = (row["margin_mm"] for row in rows)
+    others_mm = 2.0 + np.hypot(3.0, np.hypot(2, 3))
+    for kept_mm, asked_mm in (plain_mm, 5.0), (with_errors_mm, 5.0 + others_mm):
         assert asked_mm - 3.0 - 0.3 < kept_mm < asked_mm + 0.3
     assert plain_mm < 5.0 - 0.6
-    cuts, _ = tables_of([{"case": "balls", "method": "calibrated", **row} for row in rows])
-    kept = cuts.set_index("planner")["as asked %"]
-    assert kept["5 mm"] == "0.0 (0.0 to 97.5)"
-    assert kept["5 mm + 95 % radius"] == "100.0 (2.5 to 100.0)"
+    assert rows[1]["healthy_ml"] > rows[0]["healthy_ml"] + 0.2
+    cuts, _ = tables_of([{"case": "balls", "method": "clinic", **row} for row in rows])
+    assert list(cuts["as asked %"]) == ["0.0 (0.0 to 97.5)", "100.0 (2.5 to 100.0)"]
     assert not cuts[["cut into it", "into another tumor"]].to_numpy().any()
-    silent = cut_one(case, off, "D0", "noise", 64)
-    assert [row.get("refused", "").partition(":")[0] for row in silent[2:]] == [
-        "the estimate states no 95 % margin of tumor_1"
-    ] * 3
+
+
+def test_only_what_states_a_bound_is_planned_on_with_errors(case):
+    assert list(cuts(case, shifted())) == [OURS.name]
+
+
+def test_no_margin_is_wider_than_allowed(case):
+    located = replace(located_as_it_is(kidney()), bounds_mm={"tumor_1": 25.0})
+    plan = Planner(with_errors=True).tried(located, "tumor_1")
+    assert plan.margin_mm == 20.0
 
 
 def test_plans_are_measured_once_and_apart_from_accuracy(case, tmp_path):

@@ -77,7 +77,7 @@ def test_a_moving_organ_is_followed(story):
 
 def test_touches_bring_a_hidden_half_nearer(story):
     _, said = story
-    off = [float(mm) for mm in re.findall(r"tumor_\d: centre off by ([\d.]+) mm", said["08"])]
+    off = [float(mm) for mm in re.findall(r"tumor_\d: its centre is ([\d.]+) mm off", said["08"])]
     assert len(off) == 6  # two tumors: without, with three, with six
     assert 0 < sum(off[4:]) < sum(off[:2])
     gains = re.findall(r"next, .+: tumor_\d ([\d.]+) -> ([\d.]+) mm", said["08"])

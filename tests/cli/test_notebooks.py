@@ -53,8 +53,8 @@ def test_a_tumor_is_located(ran):
 def test_estimates_stand_beside_the_best_rigid_pose(ran):
     rows = [line.split() for line in printed(ran[1]).splitlines() if line[:5].strip().isdigit()]
     assert len(rows) == 4
-    off, std, rigid = np.array([row[2:] for row in rows], float).reshape(-1, 3).T
-    assert (std > 0).all()
+    off, bound, rigid = np.array([row[2:] for row in rows], float).reshape(-1, 3).T
+    assert (bound > 0).all()
     assert (rigid > 0).any()  # the scenes are deformed
     assert rigid.max() < 5  # mildly
     assert np.median(off) < 5
@@ -71,11 +71,12 @@ def test_a_moving_organ_is_followed_in_a_notebook(ran):
 
 def test_touches_make_a_hidden_half_surer_and_a_wrong_one_is_named(ran):
     said = printed(ran[3])
-    lines = re.findall(r"tumor_\d: centre off by ([\d.]+) mm, one deviation ([\d.]+) mm", said)
-    off_mm, std_mm = np.array(lines, float).reshape(3, 2, 2).T  # without, with three, with six
+    stated = r"tumor_\d: its centre is ([\d.]+) mm off; stated: off by at most ([\d.]+) mm"
+    lines = re.findall(stated, said)
+    off_mm, bounds_mm = np.array(lines, float).reshape(3, 2, 2).T  # without, with three, with six
     assert (off_mm < 5).all()
     assert (off_mm > 0).any()
-    assert (std_mm[:, 2] < std_mm[:, 0]).all()
+    assert (bounds_mm[:, 2] < bounds_mm[:, 0]).all()
     assert "touch the organ at" in said
     assert "poor: touch 7 lies" in said
     assert said.count("left out\n") == 1

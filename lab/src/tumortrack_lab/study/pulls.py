@@ -29,7 +29,6 @@ from tumortrack_resection.located import of_estimate
 from tumortrack_resection.values import Located, ResectionPlan
 
 PULLS_MM = (4.0, 8.0)
-_PLANNERS = PLANNERS[:2]  # that need no calibration
 _STD_MM = 1.0  # of where the arms see their tip, each axis, the same before and during the pull
 _HIDDEN_MM = 2.0  # beside the cup no point is the organ's
 _NONE, _STALE, _SEEN, _HELD = "no pull", "pull, planned before", "pull", "pull, held"
@@ -69,7 +68,7 @@ def pull_one(tracker: Tracker, world: World, number: int, grid: int = 160) -> li
     (rest,) = organ.pulled(world.organ.points_mm[0], up, [0.0])
     truth, view, cloud = seen(rest, None)
     estimate, before = located(view, cloud)
-    plans = {planner.name: planner.tried(before, tumor) for planner in _PLANNERS}
+    plans = {planner.name: planner.tried(before, tumor) for planner in PLANNERS}
     grasps = [plan.grasp_mm for plan in plans.values() if isinstance(plan, ResectionPlan)]
     if not grasps or estimate.motion is None:
         raise NoPlan(f"nothing to grip: {next(iter(plans.values()))}")
@@ -105,9 +104,9 @@ def pull_one(tracker: Tracker, world: World, number: int, grid: int = 160) -> li
                 now, there = located(view, cloud, *evidence)
             except NoEstimate as failure:
                 refused = {"refused": f"no estimate: {failure}"}
-                rows += [{**pull, "how": how, "planner": p.name, **refused} for p in _PLANNERS]
+                rows += [{**pull, "how": how, "planner": p.name, **refused} for p in PLANNERS]
                 continue
-            anew = {planner.name: planner.tried(there, tumor) for planner in _PLANNERS}
+            anew = {planner.name: planner.tried(there, tumor) for planner in PLANNERS}
             found = _found(now, there, truth, tumor)
             rows += [{**pull, "how": how, **found, **row} for row in _cuts(truth, anew)]
     return rows
@@ -151,7 +150,7 @@ def table(rows: list[dict[str, Any]]) -> pd.DataFrame:
     for (pull_mm, how, planner), plans in by:
         made = plans[plans.removed_share.notna()]
         margins = made.margin_mm.astype(float)
-        asked_mm = {p.name: p.margin_mm for p in _PLANNERS}[planner] - VOXEL_MM
+        asked_mm = {p.name: p.margin_mm for p in PLANNERS}[planner] - VOXEL_MM
         lines.append({
             "pull mm": f"{pull_mm:g}", "followed by": how, "planner": planner,
             "tumor off median mm": f"{plans.off_mm.median():.1f}",

@@ -1,5 +1,5 @@
-"""Simulated resections: plans made from a calibrated model's estimates, and from the truth, cut the
-true organs of the wider world."""
+"""Simulated resections: plans made from a model's estimates, and from the truth, cut the true
+organs of the wider world."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
@@ -28,7 +27,8 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, OccupancyCloud
 from tumortrack.registration.locator import QUERIES
 from tumortrack.simulate.scene_folder import Scene, read_scene
-from tumortrack.tracking.bound_factor import NAME, read_factor
+from tumortrack.tracking.bound_factor import NAME
+from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.cut import VOXEL_MM, cut
@@ -38,15 +38,13 @@ from tumortrack_lab.study.methods import Method, StudyCase, code_sha256
 from tumortrack_lab.study.tables import NOTHING, ordered
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
 from tumortrack_lab.twin.apparatus import moved
-from tumortrack_resection.budget import ErrorBudget, plan_within, planned_budgets
+from tumortrack_resection.budget import planned_budgets
 from tumortrack_resection.located import of_estimate
 from tumortrack_resection.resection import plan_resection
-from tumortrack_resection.values import Located, ResectionConfig, ResectionPlan
+from tumortrack_resection.values import MARGIN_MM, Located, ResectionConfig, ResectionPlan
 
 TRUTH = "truth"
 _FINE = 256  # voxels along the true organ: its points' labels err by 0.2 mm
-MARGIN_MM = 5.0  # the paper's
-SIGMAS = 2.0
 WHOLE = 0.999  # of a tumor: what is missing is a voxel's rounding
 _NUMBERS = ["removed_share", "cut_share", "left_ml", "margin_mm"]
 _NUMBERS += ["healthy_ml", "kerf_ml", "kerf_area_mm2"]
@@ -55,64 +53,40 @@ _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
 class Planner(Config, frozen=True):
-    """One way to plan: ``sigmas`` standard deviations of the estimate are added to the margin, or
-    all errors with a ``confidence``, as by `plan --confidence`. ``still``: of these only the
-    tumor's radius, as a simulated cut has no other error."""
+    """One way to plan: at a margin, or ``with_errors`` at as much more as the errors sum up to that
+    a plan has to cover."""
 
-    sigmas: float = 0.0
-    margin_mm: float = MARGIN_MM
-    confidence: float = 0.0
-    still: bool = False
+    with_errors: bool = False
+    margin_mm: float = 5.0  # the paper's
 
     @property
     def name(self) -> str:
-        more = f" + {self.sigmas:g} sd" if self.sigmas else ""
-        if self.confidence:
-            what = "radius" if self.still else "radius and other errors"
-            more = f" + {100 * self.confidence:g} % {what}"
-        return f"{self.margin_mm:g} mm{more}"
-
-    def plan(self, located: Located, tumor: str) -> ResectionPlan:
-        """Raises InputError and NoPlan as ``plan_within``."""
-
-        def plan_of(config: ResectionConfig) -> ResectionPlan:
-            return plan_resection(located, config)
-
-        def budgets_of(plan: ResectionPlan) -> tuple[ErrorBudget, ...]:
-            budgets = planned_budgets(plan, located, confidence=self.confidence or None)
-            others = {"hand_eye_mm": 0.0, "tool_mm": 0.0, "motion_mm": 0.0, "assumed": ()}
-            changed = others if self.still else {}
-            return tuple(msgspec.structs.replace(budget, **changed) for budget in budgets)
-
-        config = ResectionConfig(tumor=tumor, margin_mm=self.margin_mm, sigmas=self.sigmas)
-        return plan_within(plan_of, config, budgets_of, self.confidence > 0)[0]
+        return f"{self.margin_mm:g} mm{' + errors' if self.with_errors else ''}"
 
     def tried(self, located: Located, tumor: str) -> ResectionPlan | str:
         """A plan, or why there is none."""
         try:
-            return self.plan(located, tumor)
+            plan = plan_resection(located, ResectionConfig(tumor=tumor, margin_mm=self.margin_mm))
+            if not self.with_errors:
+                return plan
+            wider_mm = self.margin_mm + planned_budgets(plan, located)[0].sum_mm
+            config = ResectionConfig(tumor=tumor, margin_mm=min(wider_mm, MARGIN_MM[1]))
+            return plan_resection(located, config)
         except (NoPlan, InputError) as error:
             return str(error)
 
 
-# All but the last keep the same healthy tissue.
-PLANNERS = (
-    Planner(),
-    Planner(sigmas=SIGMAS),
-    Planner(confidence=0.95, still=True),
-    Planner(confidence=0.95),
-    Planner(confidence=0.95, margin_mm=1.0),
-)
+PLANNERS = (Planner(), Planner(with_errors=True))
 
 
-def calibrated(folder: Path) -> Method:
-    """A model with its bounds' factor, judged by all that the camera saw, as `locate` does it.
-    Raises InputError: it has none."""
-    if read_factor(folder) is None:
-        raise InputError(f"{folder} was not calibrated: tumortrack margins CASE SCENES.")
+def tracked(folder: Path) -> Method:
+    """A model and its bounds' factor, if it has one, judged by all that the camera saw, as `locate`
+    does it."""
     tracker = cache(lambda: Tracker(load_model(folder)))
-    identity = {name: store.sha256_of(folder / name) for name in (store.MANIFEST, NAME)}
-    return Method("calibrated", identity, lambda s, n: tracker().locate(s.cloud, n, 0, s.depth))
+    paths = [path for name in (store.MANIFEST, NAME) if (path := folder / name).exists()]
+    identity = {path.name: store.sha256_of(path) for path in paths}
+    identity |= {"tumortrack": tumortrack.__version__, "fingerprint": fingerprint()}
+    return Method("model", identity, lambda s, n: tracker().locate(s.cloud, n, 0, s.depth))
 
 
 def truth() -> Method:
@@ -177,7 +151,7 @@ def cut_one(
         {"tumor": name, "planner": p.name, **about, **effects(true, p.tried(located, name))}
         for name in tumors
         for p in PLANNERS
-        if not (p.sigmas or p.confidence) or located.std_mm  # others know no uncertainty
+        if not p.with_errors or name in located.bounds_mm  # others know no bound
     ]
 
 
