@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -51,7 +52,7 @@ class BoundModel(Config, frozen=True):
     fingerprint: str
     tumor: Quantile
     organ: Quantile
-    advice: dict[str, float]
+    advice: Mapping[str, float]
     about: dict[str, Any]
 
 

@@ -29,7 +29,15 @@ from tumortrack.core.report import Point
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
 from tumortrack.report.renderer import Body, ParallelView, corner_normals, render, rgb
-from tumortrack.report.seen import PAGE, Seen, alternative_lines, next_evidence, next_lines, part_rows, row_words
+from tumortrack.report.seen import (
+    PAGE,
+    Seen,
+    alternative_lines,
+    next_evidence,
+    next_lines,
+    part_rows,
+    row_words,
+)
 from tumortrack.report.wrapping import wrapped
 from tumortrack.sense.camera import deproject
 from tumortrack.sense.region.working_image import ORGAN, sampled_pixels

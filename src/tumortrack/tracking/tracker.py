@@ -112,8 +112,9 @@ class Tracker:
             )
         looks: Sequence[Look]
         looks, pieces = _parted(cloud, seen, evidence)
+        shown: tuple[Evidence, ...] = ()
         if not len(cloud.points_mm) and pieces:
-            alone, pieces = touched(pieces, self.model.parts[0])
+            alone, shown, pieces = touched(pieces, self.model.parts[0])
             looks = (Look(replace(alone, stamp_ns=cloud.stamp_ns), cloud, HERE),)
 
         def located(looks: Sequence[Look]) -> Estimate:

@@ -4,16 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
+from msgspec.structs import replace as replace_struct
 from scipy.interpolate import RBFInterpolator
 from scipy.optimize import minimize
 from scipy.stats import spearmanr
 
-from tumortrack.assessment.bound import POOR_MM, BoundModel, Quantile, figures
+from tumortrack.assessment.advice import advise
+from tumortrack.assessment.bound import (
+    POOR_MM,
+    BoundModel,
+    Quantile,
+    figures,
+    foreseen_mm,
+)
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import FAR_MM, Estimate
 from tumortrack.core.geometry import transform_points
@@ -44,6 +53,8 @@ EVIDENCE: tuple[dict[str, int], ...] = (
     {"landmark": 1}, {"landmark": 3}, {"landmark": 6}, {"held": 1}, {"touch": 12, "outline": 1},
     {"free": 3},
 )  # fmt: skip
+ALONE: tuple[dict[str, int], ...] = {"touch": 16}, {"touch": 48}, {"plane": 3}, {"plane": 12}
+_NO_CLOUD = SensorCloud(np.zeros((0, 3), np.float32))
 
 
 class _Asked(NamedTuple):
@@ -53,12 +64,14 @@ class _Asked(NamedTuple):
     seen: DepthFrame | None
     evidence: Mapping[str, int]
     false_too: bool = False
+    alone: bool = False  # without a cloud
 
 
 def rows_of(tracker: Tracker, scene: Scene, seed: int) -> Iterator[dict[str, Any]]:
     """A row a part and answer: the largest miss of its points, its centre's, its figures, and the
     verdict so far. The scene is asked alone, by cloud and by image, then in pairs without and with
-    evidence, of half of them a share hidden, noisy or both. Without an answer there is none."""
+    evidence, of half of them a share hidden, noisy or both, and by touches or outlines without a
+    cloud. Without an answer there is none."""
     model, rng = tracker.model, np.random.default_rng([seed, 53])
     assert isinstance(model, RegistrationModel)
     for number, asked in enumerate(_asked(scene, rng)):
@@ -66,12 +79,13 @@ def rows_of(tracker: Tracker, scene: Scene, seed: int) -> Iterator[dict[str, Any
             asked.scene, [seed, number], ERRORS if asked.false_too else ALL_TRUE
         )
         pieces = [piece.evidence for piece in source.drawn(asked.evidence)]
+        cloud = _NO_CLOUD if asked.alone else asked.scene.cloud
         try:
-            found = tracker.locate(asked.scene.cloud, 8, 0, asked.seen, pieces)
+            found = tracker.locate(cloud, 8, 0, asked.seen, pieces)
         except NoEstimate:
             continue
         rigid_mm = _rigid_misses(model, asked.scene) if number == 0 else {}
-        kinds = "+".join(sorted(asked.evidence)) or "none"
+        kinds = "alone: " * asked.alone + ("+".join(sorted(asked.evidence)) or "none")
         for name, largest_mm, center_mm in _misses(found, scene, model):
             known = figures(found.report, name)
             if known is not None:
@@ -99,6 +113,67 @@ def _asked(scene: Scene, rng: Generator) -> Iterator[_Asked]:
             shown = _noisy(shown, rng.uniform(0.5, 2.0), rng)
         yield _Asked(shown, None, {})
         yield _Asked(shown, None, EVIDENCE[rng.integers(len(EVIDENCE))], rng.uniform() < 0.5)
+    yield _Asked(scene, None, ALONE[rng.integers(len(ALONE))], alone=True)
+
+
+def advice_rows(tracker: Tracker, scene: Scene, seed: int) -> Iterator[dict[str, Any]]:
+    """Of a scene that is half hidden, what advice on its least sure tumor foresaw of the bound, and
+    what came of it: a row for the best three touches, and for the best outline."""
+    rng = np.random.default_rng([seed, 54])
+    scene = hidden(scene, 0.5, rng)
+    try:
+        before = tracker.locate(scene.cloud, 8, 0)
+    except NoEstimate:
+        return
+    tumors, bounds = before.report.tumors, before.assessment.bounds
+    part = max(tumors, key=lambda name: bounds[name].error_bound95_mm)
+    advice = advise(before, part)
+    assert isinstance(tracker.model, RegistrationModel)
+    missed = {name: mm for name, mm, _ in _misses(before, scene, tracker.model)}
+    for kind in ("touch", "outline"):
+        source = EvidenceSource.of(scene, [seed, 54], ALL_TRUE)
+        mine = [each for each in advice if each.kind == kind]
+        if not mine:
+            continue
+        if kind == "touch":
+            pieces = source.touches(*(np.array([getattr(each, field) for each in mine])
+                                      for field in ("place_mm", "direction")))  # fmt: skip
+        else:
+            number = int(part.removeprefix("tumor_")) - 1
+            outline = source.outline(number, np.array(mine[0].direction))
+            pieces = [] if outline is None else [outline]
+        foreseen = replace_struct(mine[-1], std_mm=mine[0].std_mm)
+        then_mm = foreseen_mm(before.report, foreseen)
+        try:
+            after = tracker.locate(scene.cloud, 8, 0, None, [each.evidence for each in pieces])
+        except NoEstimate:
+            continue
+        assert then_mm is not None
+        yield {
+            "kind": kind,
+            "foreseen_mm": bounds[part].error_bound95_mm - then_mm,
+            "found_mm": bounds[part].error_bound95_mm
+            - after.assessment.bounds[part].error_bound95_mm,
+            "miss_before_mm": missed[part],
+            "miss_after_mm": {n: mm for n, mm, _ in _misses(after, scene, tracker.model)}[part],
+        }
+
+
+def advice_found(rows: pd.DataFrame) -> pd.DataFrame:
+    """By kind of evidence, how much the bound fell over what was foreseen where that was more than
+    a third of a millimetre, and the misses before and after."""
+    lines = []
+    for kind, some in rows[rows.foreseen_mm > 1 / 3].groupby("kind"):
+        lines.append({
+            "kind": kind,
+            "answers": len(some),
+            "foreseen, mm": round(some.foreseen_mm.mean(), 2),
+            "found": round(some.found_mm.mean(), 2),
+            "found / foreseen": round(some.found_mm.mean() / some.foreseen_mm.mean(), 2),
+            "miss before: median": round(some.miss_before_mm.median(), 2),
+            "and after": round(some.miss_after_mm.median(), 2),
+        })  # fmt: skip
+    return pd.DataFrame(lines)
 
 
 def _noisy(scene: Scene, std_mm: float, rng: Generator) -> Scene:
@@ -141,12 +216,13 @@ def _rigid_misses(model: RegistrationModel, scene: Scene) -> dict[str, float]:
     }
 
 
-def learned(rows: pd.DataFrame, about: dict[str, Any]) -> BoundModel:
-    """Of tumors and organs."""
+def learned(
+    rows: pd.DataFrame, about: dict[str, Any], advice: Mapping[str, float] = MappingProxyType({})
+) -> BoundModel:
+    """Of tumors and organs; ``advice``: see ``BoundModel``."""
     tumor = rows.part.map(is_tumor)
-    quantiles = [quantile_of(rows[mine]) for mine in (tumor, ~tumor)]
-    advice = about.pop("advice", {})
-    return BoundModel(fingerprint(), *quantiles, advice, {**about, "answers": len(rows)})
+    of_tumor, of_organ = (quantile_of(rows[mine]) for mine in (tumor, ~tumor))
+    return BoundModel(fingerprint(), of_tumor, of_organ, advice, {**about, "answers": len(rows)})
 
 
 def quantile_of(rows: pd.DataFrame) -> Quantile:

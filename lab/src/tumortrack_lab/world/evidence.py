@@ -30,6 +30,7 @@ Points = Float[np.ndarray, "n 3"]
 
 _UNSEEN_MM = 8.0  # from any point of the cloud: well beyond its noise and spacing
 _PLACES = 12  # of an outline
+_CENTRAL = 0.15, 0.85  # of the vertices, between which planes lie
 _SHAFT_MM, _SHAFT_RADIUS_MM = (5.0, 60.0), 3.0  # from the surface
 _SEEN_SHARE = 0.2  # of the inner points, those nearest to the cloud: what a person can recognise
 
@@ -119,7 +120,7 @@ class EvidenceSource:
         return self.touches(centres[chosen], doubled[chosen])
 
     def drawn(self, numbers: Mapping[str, int]) -> list[Piece]:
-        """So many pieces of each kind (touch, landmark, held, free), at random; of outlines,
+        """So many pieces of each kind (touch, landmark, held, free, plane), at random; of outlines,
         so many of each tumor. Raises InputError: the scene has no points to recognise or hold."""
         if self.scene.targets is None and numbers.keys() & {"landmark", "held"}:
             raise InputError(
@@ -134,6 +135,7 @@ class EvidenceSource:
             *(self.landmarks(n) if (n := numbers.get("landmark", 0)) else ()),
             *(self.held(n % max(tumors, 1)) for n in range(numbers.get("held", 0))),
             *(self.free() for _ in range(numbers.get("free", 0))),
+            *(self.plane() for _ in range(numbers.get("plane", 0))),
         ]
 
     def outline(self, tumor: int, normal: Float[np.ndarray, " 3"] | None = None) -> Piece | None:
@@ -157,6 +159,18 @@ class EvidenceSource:
         stated = self._stated(middle, half_mm)
         stated |= {"shared_std_mm": float(np.hypot(stated["shared_std_mm"], half_mm)), "tool": ""}
         return Piece(Outline(places_mm=_tuples(told), part=name, **stated))
+
+    def plane(self) -> Piece:
+        """The organ's outline in an ultrasound image: in a plane through it, not near its ends."""
+        organ, normal = self.scene.reference.organ, self.normal()
+        low, high = np.quantile(organ.vertices_mm @ normal, _CENTRAL)
+        middle = organ.vertices_mm.mean(0)
+        middle = middle + (self.rng.uniform(low, high) - middle @ normal) * normal
+        places = plane_section(organ.vertices_mm, organ.faces, normal, middle).mean(1)
+        places = places[np.linspace(0, len(places), _PLACES, endpoint=False).astype(int)]
+        told = self._by_robot(places) + self.rng.normal(0, self.errors.probe_mm, places.shape)
+        stated = self._stated(middle, self.errors.probe_mm)
+        return Piece(Outline(places_mm=_tuples(told), part=self.scene.reference.names[0], **stated))
 
     def normal(self) -> Float[np.ndarray, " 3"]:
         """Of a random plane."""

@@ -84,7 +84,8 @@ def random_anatomy(
 def _random_parameters(rng: np.random.Generator, shape: Shape) -> digital.PhantomParameters:
     """The shape of a random organ and its tumors."""
     length = rng.uniform(*shape.length_mm)
-    size = (*(length * rng.uniform(*share) for share in shape.across), length)
+    width, thickness = (length * rng.uniform(*share) for share in shape.across)
+    size = width, thickness, length
     return digital.PhantomParameters(
         size_mm=size,
         bend_mm=rng.uniform(*shape.bend_mm),
