@@ -149,7 +149,7 @@ def test_an_outline_of_one_piece_and_touches_of_their_own(tmp_path):
         "piece,frame,kind,x_mm,y_mm,z_mm,part\n"
         "a,camera,outline,1,2,150,tumor_1\na,camera,outline,3,4,151,tumor_1\n"
     )
-    (outline,) = read_evidence(path)
+    (outline,) = read_evidence(path)[1]
     assert outline.places == ((1.0, 2.0, 150.0), (3.0, 4.0, 151.0))
     path.write_text(path.read_text().replace("outline", "touch"))
     with pytest.raises(InputError, match="line 3"):

@@ -41,7 +41,12 @@ class OccupancyLocator:
         self.inference = Inference(model.network)
 
     def locate(
-        self, looks: Sequence[Look], grid: int, seed: int, evidence: Sequence[Evidence] = ()
+        self,
+        looks: Sequence[Look],
+        grid: int,
+        seed: int,
+        evidence: Sequence[Evidence] = (),
+        any_pose: bool = False,
     ) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``. The two passes of queries are those of the
         follow-up (LUDO): 10,000 coarse ones where the organ can be, then 40,000 in the enlarged box

@@ -14,6 +14,7 @@ from tumortrack.core.assessment import Assessment
 from tumortrack.core.config import findings_in
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.estimate import Estimate
+from tumortrack.core.evidence import CAMERA
 from tumortrack.core.geometry import rigid
 from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.organ import KIDNEY, is_tumor, organ_first, organ_name
@@ -82,6 +83,11 @@ def read_run(folder: Path) -> Located:
     """A run's folder, camera frame. Raises ArtifactError: no such run, damaged, or without its
     cloud."""
     stored, manifest = read_report(folder), read_json(folder / MANIFEST)
+    if (frame := manifest.get("frame", CAMERA)) != CAMERA:
+        raise InputError(
+            f"{folder} is in the frame {frame!r}, which no camera has; plans are made on runs in a "
+            "camera's frame. Locate with an image or a cloud."
+        )
     path = folder / "occupancy.ply"
     try:
         report = msgspec.convert(stored, _Report)

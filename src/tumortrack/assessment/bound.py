@@ -23,6 +23,7 @@ _NAME = "bounds.json"
 # An answer is poor from this bound on. docs/trust.md has what that is worth for organs, families
 # of physics and kinds of evidence left out.
 POOR_MM = 6.0
+CONFIDENCE = 0.95
 _MOST_STRAYS, _FARTHEST_RIVAL_MM = 0.3, 10.0  # more say no more
 _LEAST_HELD_MM = 0.05  # nor does less
 _WITHIN = 1.96  # standard deviations: 95 % of a normal distribution
@@ -107,13 +108,25 @@ def foreseen_mm(report: FitReport, advice: NextEvidence) -> float | None:
     return math.hypot(bound_mm, depths_within_mm(report, advice.part))
 
 
+def elsewhere_mm(report: FitReport, name: str) -> float:
+    """How far off a part's centre is at most (95 %) by other fits that are as likely."""
+    rivals = () if report.fit_cost is None else report.fit_cost.others
+    left = 1 - CONFIDENCE
+    for rival in sorted(rivals, key=lambda rival: -rival.apart_mm[name]):
+        left -= rival.share
+        if left < 0:
+            return rival.apart_mm[name]
+    return 0.0
+
+
 def bounds_of(report: FitReport) -> dict[str, ErrorBound]:
     """Of each part, where the method knows enough: what was learned, and what the camera's depths
-    err by beside that."""
+    err by beside that; at least how far off it is in fits that are as likely."""
     bounds = {}
     for name, part in report.parts.items():
         quantile = shipped().tumor if name in report.tumors else shipped().organ
         if (known := figures(report, name)) is not None:
             bound_mm = math.hypot(quantile.bound_mm(known), depths_within_mm(report, name))
+            bound_mm = max(bound_mm, elsewhere_mm(report, name))
             bounds[name] = ErrorBound(bound_mm, part.center_axes and part.center_axes[0])
     return bounds

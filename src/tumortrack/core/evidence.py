@@ -19,6 +19,7 @@ from tumortrack.core.geometry import Points
 from tumortrack.core.report import Point
 from tumortrack.core.types import DepthError, PointNoise, SensorCloud
 
+CAMERA = "camera"  # the frame of images and clouds
 _REACH_MM = 2000.0  # of anything that a camera above a patient sees
 _LEAST_MM = 3.0  # no camera has an organ nearer
 FEWEST_TOUCHES = 12  # without a cloud; `make evidence`: how far off 12, 24 and 48 leave it
@@ -145,12 +146,13 @@ def _tuples(places: np.ndarray) -> Any:
     return tuple(map(_tuples, places)) if places.ndim > 1 else tuple(map(float, places))
 
 
-def read_evidence(path: Path) -> tuple[Evidence, ...]:
-    """Of a JSON file, see ``EvidenceFile``, or a table (.csv), a row for each place. Raises
+def read_evidence(path: Path, with_camera: bool = True) -> tuple[str, tuple[Evidence, ...]]:
+    """Of a JSON file, see ``EvidenceFile``, or a table (.csv), a row for each place: the frame, and
+    the pieces. ``with_camera``: there are images or clouds, in whose frame they must be. Raises
     InputError: missing, another frame or unit, a value that is not allowed."""
     if path.suffix.lower() in (".csv", ".tsv", ".txt"):
-        return _table(path)
-    known = _checked(store.read_json(path), str(path))
+        return _table(path, with_camera)
+    known = _checked(store.read_json(path), str(path), with_camera)
     if not known.evidence:
         raise InputError(f"{path} holds no evidence. Leave it out, or add some.")
     for number, each in enumerate(known.evidence, start=1):
@@ -159,15 +161,17 @@ def read_evidence(path: Path) -> tuple[Evidence, ...]:
                 f"{path}: {each.name} {number} is of {each.stamp_ns} ns, before the organ lay "
                 f"still (still_since_ns: {known.still_since_ns}). Leave it out, or take it again."
             )
-    return known.evidence
+    return known.frame, known.evidence
 
 
-def _checked(given: dict[str, Any], where: str) -> EvidenceFile:
+def _checked(given: dict[str, Any], where: str, with_camera: bool) -> EvidenceFile:
     known = from_builtins(given, EvidenceFile, where)
-    if (known.frame, known.unit) != ("camera", "mm"):
+    wrong_frame = known.frame != CAMERA if with_camera else not known.frame.isprintable()
+    if wrong_frame or not known.frame or known.unit != "mm":
         raise InputError(
             f"{where} is in frame {known.frame!r} and unit {known.unit!r}; allowed: frame 'camera' "
-            "(x right, y down, z forward) and unit 'mm'. Transform it first."
+            "(x right, y down, z forward; without a cloud any other, by its name) and unit 'mm'. "
+            "Transform it first."
         )
     return known
 
@@ -183,7 +187,7 @@ _FURTHER = (*_READ, "part", "tool")
 _OF_PLACES = ("outline", "free")
 
 
-def _table(path: Path) -> tuple[Evidence, ...]:
+def _table(path: Path, with_camera: bool) -> tuple[str, tuple[Evidence, ...]]:
     """From a table, in which rows of one ``piece`` are places of one."""
     table = read_rows(store.read_file(path, _LARGEST_FILE), str(path), _NEEDED, _FURTHER)
     pieces: dict[str, tuple[str, dict[str, Any], list[Any]]] = {}
@@ -200,13 +204,16 @@ def _table(path: Path) -> tuple[Evidence, ...]:
                 "several, which differ in x, y and z alone. Give another piece another name."
             )
         places.append(place)
-    found: list[Evidence] = []
+    found, frames = list[Evidence](), set[str]()
     for where, given, places in pieces.values():
         several = given["kind"] in _OF_PLACES
         given |= {"places_mm": places} if several else {"place_mm": places[0]}
         whole = {"frame": given.pop("frame"), "unit": "mm", "evidence": [given]}
-        found += _checked(whole, where).evidence
-    return tuple(found)
+        piece_known = _checked(whole, where, with_camera)
+        found, frames = [*found, *piece_known.evidence], frames | {piece_known.frame}
+    if len(frames) > 1:
+        raise InputError(f"{path} has places in frames {', '.join(sorted(frames))}; give one.")
+    return frames.pop(), tuple(found)
 
 
 def _cells(row: dict[str, str], where: str) -> dict[str, Any]:

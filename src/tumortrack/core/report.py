@@ -129,20 +129,22 @@ class Residuals(_Value, frozen=True, kw_only=True):
 
 
 class RivalFit(_Value, frozen=True, kw_only=True):
-    """Another fit, which costs ``more``; ``apart_mm``: how far off the parts' middles lie in it, at
-    ``center_mm``, with the organ turned by so much."""
+    """Another fit, which costs ``more``, and has this ``share`` of the probability; ``apart_mm``:
+    how far off the parts' middles lie in it, at ``center_mm``, with the organ turned by so much."""
 
     more: float
     apart_mm: dict[str, float]
     center_mm: dict[str, Point] = {}
     turn_degrees: float = 0.0
+    share: float = 0.0
 
     @property
     def words(self) -> str:
         places = (
             f"{n} at ({x:.1f}, {y:.1f}, {z:.1f}) mm" for n, (x, y, z) in self.center_mm.items()
         )
-        return f"as likely, turned by {self.turn_degrees:.0f} degrees: {', '.join(places)}"
+        chance = f"with a chance of {100 * self.share:.0f} %"
+        return f"or, {chance}, turned by {self.turn_degrees:.0f} degrees: {', '.join(places)}"
 
 
 class ExcludedFit(_Value, frozen=True, kw_only=True):

@@ -37,7 +37,12 @@ class Locator(Protocol):
     anatomy_ct: Anatomy | None
 
     def locate(
-        self, looks: Sequence[Look], grid: int, seed: int, evidence: Sequence[Evidence] = ()
+        self,
+        looks: Sequence[Look],
+        grid: int,
+        seed: int,
+        evidence: Sequence[Evidence] = (),
+        any_pose: bool = False,
     ) -> Estimate:
         """See ``Tracker.locate``. The estimate is in the frame of the first look's camera."""
 

@@ -126,6 +126,7 @@ class RegistrationLocator:
         self._model, self._shape, self._calibration = model, model.shape, model.calibration
         self._advised = part_number(advise, model.parts) if advise else None
         self._registration = known = model.registration
+        self._anyhow = replace(known, prior=replace(known.prior, tilt_degrees=180.0))
         self._turned_over = replace(known, prior=replace(known.prior, either_side=True))
         self._near = msgspec.structs.replace(model.config.refine, first_mm=_MOVED_MM)
         anatomy = model.shape.anatomy_ct
@@ -143,7 +144,12 @@ class RegistrationLocator:
         self._carried: _OrganPoints | None = None
 
     def locate(
-        self, looks: Sequence[Look], grid: int, seed: int, evidence: Sequence[Evidence] = ()
+        self,
+        looks: Sequence[Look],
+        grid: int,
+        seed: int,
+        evidence: Sequence[Evidence] = (),
+        any_pose: bool = False,
     ) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``."""
         cloud = looks[0].cloud
@@ -151,7 +157,8 @@ class RegistrationLocator:
         fewest = FEWEST_TOUCHES if alone else FEWEST_POINTS
         frame = Frame(self._model, cloud, seed, np.random.default_rng(seed), fewest)
         points = self._points(frame, looks, evidence=EvidenceTerms.of(evidence, self._touchable))
-        fit = self._registration.register(points, None, frame.stage)
+        method = self._anyhow if any_pose else self._registration
+        fit = method.register(points, None, frame.stage)
         bent = self._bent(fit, frame)
         size = apparent_size(fit.motion, fit.looks, self._registration.config)
         placed = self._checked(fit, bent, size, frame)
@@ -162,8 +169,8 @@ class RegistrationLocator:
             camera_from_index, shape = grid_over(organ.vertices_mm, grid)
             labels = label_grid(Anatomy(tuple(placed.meshes.values())), camera_from_index, shape)
         voxel_mm = float(camera_from_index[0, 0])
-        prior, more = self._registration.prior, {"size": size, "voxel_mm": voxel_mm}
-        found = self._found(fit, prior=self._registration.prior, pieces=tuple(evidence))
+        prior, more = method.prior, {"size": size, "voxel_mm": voxel_mm}
+        found = self._found(fit, prior, tuple(evidence))
         said, known = self._evidence_report(placed, found)
         advice: tuple[NextEvidence, ...] = ()
         if len(self._model.parts) > 1:

@@ -25,8 +25,8 @@ def cost_entry(
         far = np.abs(fit.distances_mm) > FARTHEST * looks.width_mm(config)
         strays = max(float(far[looks.look == n].mean()) for n in range(looks.count))
     rivals = [
-        RivalFit(more=rival.cost - fit.cost, **_beside(fit.motion, rival.motion))
-        for rival in fit.rivals
+        RivalFit(more=rival.cost - fit.cost, share=share, **_beside(fit.motion, rival.motion))
+        for rival, (_, share) in zip(fit.rivals, fit.motion.rivals, strict=False)
     ]
     return FitCost(
         now=now,

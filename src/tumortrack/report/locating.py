@@ -12,7 +12,7 @@ from tumortrack.assessment.bound import depths_within_mm
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.evidence import read_evidence
+from tumortrack.core.evidence import CAMERA, Evidence, read_evidence
 from tumortrack.report.seen import Seen
 from tumortrack.tracking.options import LocateOptions, check_grid, model_folder
 from tumortrack.tracking.points import PointTable, check_near_organ, read_points
@@ -84,7 +84,9 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
     folder = model_folder(given)
     points = _points(given, folder, options)
     frame_id, fixed_from_camera = read_places(options.poses, len(clouds))
-    evidence = () if options.evidence is None else read_evidence(options.evidence)
+    frame, evidence = CAMERA, tuple[Evidence, ...]()
+    if options.evidence is not None:
+        frame, evidence = read_evidence(options.evidence, clouds[0] != NO_CLOUD)
     views = read_views(clouds, options)
     hints = views[0].hints(options.at, options.mask)
 
@@ -109,7 +111,7 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
         found.extend(view.organ(model, options, hints) for view in views)
         organs = [organ.cloud for organ in found]
         looks = further_looks(organs, views, fixed_from_camera)
-        known = views[0].content, (*looks, *evidence)
+        known = views[0].content, (*looks, *evidence), frame
         estimate = tracker.locate(organs[0], options.grid, options.seed, *known)
     except NoEstimate as error:
         about["input"] = [organ.entry for organ in found]
@@ -138,6 +140,9 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
             "poses_sha256": store.sha256_of(options.poses),
             "clouds_sha256": [store.sha256_of(path) for path in clouds],
         }
+    if frame != CAMERA:
+        about["frame"] = frame
+        about["notes"].append(f"all places are in the frame {frame!r}: the organ may lie any way.")
     if options.evidence is not None:
         about["evidence_sha256"] = store.sha256_of(options.evidence)
     if options.map is not None and points is not None:

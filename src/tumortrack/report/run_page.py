@@ -21,6 +21,7 @@ from PIL import Image, ImageDraw, ImageFont
 from tumortrack.core import colours
 from tumortrack.core.assessment import Quality
 from tumortrack.core.estimate import Estimate, verdict_words
+from tumortrack.core.evidence import CAMERA
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.organ import is_tumor
 from tumortrack.core.patient import patient_in
@@ -102,7 +103,9 @@ def _figures(panels: list[Panel]) -> str:
 
 def _lines(report: dict[str, Any], estimate: Estimate | None) -> Iterator[str]:
     patient = _sentence(str(patient_in(report.get("patient"), "report")))
-    yield f"{patient}. Camera frame: x right, y down, z away."
+    frame = report.get("frame", CAMERA)
+    axes = "Camera frame: x right, y down, z away" if frame == CAMERA else f"Frame: {frame}"
+    yield f"{patient}. {axes}."
     if estimate is not None and estimate.assessment.factor != 1.0:
         yield f"{_sentence(estimate.assessment.factor_words)}."
     yield from (view["words"] for view in report.get("input", ()))

@@ -17,6 +17,7 @@ from tumortrack.core.assessment import Assessment, Quality
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.estimate import Estimate
+from tumortrack.core.evidence import CAMERA
 from tumortrack.core.geometry import RAS_FROM_LPS, largest_std_of, std_of
 from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.mesh_query import exact_margin
@@ -83,7 +84,7 @@ def write_estimate(
 
 def report_head(stamp_ns: int) -> dict[str, Any]:
     """The first entries of every report."""
-    about = {"tumortrack": tumortrack.__version__, "units": "mm", "frame": "camera"}
+    about = {"tumortrack": tumortrack.__version__, "units": "mm", "frame": CAMERA}
     return {**about, "stamp_ns": stamp_ns}
 
 
@@ -119,7 +120,8 @@ def write_no_estimate(
 
 def _seal(folder: Path, report: dict[str, Any], verdict: Quality) -> None:
     store.write_json(folder / "report.json", report)
-    store.seal(folder, "run", {"report": "report.json", "verdict": verdict}, frame="camera")
+    content = {"report": "report.json", "verdict": verdict}
+    store.seal(folder, "run", content, frame=report.get("frame", CAMERA))
 
 
 def has_no_estimate(folder: Path) -> bool:

@@ -19,8 +19,8 @@ from tumortrack.assessment.verdict import doubt_if_hidden, judged
 from tumortrack.core.config import Config, check_seed
 from tumortrack.core.errors import InputError, NoEstimate, NotThisOrgan
 from tumortrack.core.estimate import Estimate, FollowOptions
-from tumortrack.core.evidence import Evidence, touched
-from tumortrack.core.geometry import HERE, Affine, transform_points
+from tumortrack.core.evidence import CAMERA, Evidence, touched
+from tumortrack.core.geometry import HERE, Affine, rigid, transform_points
 from tumortrack.core.process import keep_small_blocks
 from tumortrack.core.report import Cause, Finding, Likely
 from tumortrack.core.types import Anatomy, DepthFrame, Look, SensorCloud
@@ -47,6 +47,7 @@ _CAUSES_EVERY_S = 1.0
 # Evidence outlasts a hand before the camera: tissue carries what lies on it, as it is seen again.
 _REMEMBERED_S = 60.0
 _NOTHING_HIDES = 0.9  # of the organ's image is in sight; the rest has no return, as at its edges
+_BEFORE_MM = np.array([0.0, 0.0, 300.0])  # of a camera that there is not
 _NO_CAUSE = (Likely(Cause.VIEW),)
 _FARTHEST_MM = 700.0  # of an organ before a camera on a stand
 _OF_POSES = "none", "poses", "fit", "strays", "seen_through"  # checks that wrong poses fail
@@ -88,6 +89,7 @@ class Tracker:
         seed: int = 0,
         seen: DepthFrame | SensorCloud | None = None,
         evidence: Sequence[Evidence | Look] | Evidence | Look = (),
+        frame: str = CAMERA,
     ) -> Estimate:
         """The full estimate from one cloud; the same cloud and seed give the same result.
 
@@ -97,6 +99,8 @@ class Tracker:
             evidence: what else is known of where it lies then: each ``Look`` from another place,
                 ``Touch``, ``Landmark``, ``Held``, ``Outline``, ``Free``, in the frame of ``cloud``,
                 which may be empty: then of twelve places or more, touched or outlined.
+            frame: without a cloud: of the evidence, and of the answer; in another one than a
+                camera's the organ may lie any way.
 
         Raises:
             NoEstimate: too few points, no organ found in them, not the organ of this model, or the
@@ -112,13 +116,38 @@ class Tracker:
             )
         looks: Sequence[Look]
         looks, pieces = _parted(cloud, seen, evidence)
+        if frame != CAMERA:
+            return self._elsewhere(cloud, pieces, grid, seed)
+        return self._located(cloud, looks, pieces, grid, seed)
+
+    def _elsewhere(
+        self, cloud: SensorCloud, pieces: Sequence[Evidence], grid: int, seed: int
+    ) -> Estimate:
+        """By evidence alone in any frame: as if a camera, which could lie any way, saw it."""
+        if len(cloud.points_mm) or not pieces:
+            raise InputError("clouds are in a camera's frame; only evidence without one is not.")
+        away_mm = _BEFORE_MM - np.concatenate([each.places for each in pieces]).mean(0)
+        moved = [each.at(np.array(each.places) + away_mm, each.std_mm) for each in pieces]
+        found = self._located(cloud, (Look(cloud, cloud, HERE),), tuple(moved), grid, seed, True)
+        return _shifted(found, -away_mm)
+
+    def _located(
+        self,
+        cloud: SensorCloud,
+        looks: Sequence[Look],
+        pieces: tuple[Evidence, ...],
+        grid: int,
+        seed: int,
+        any_pose: bool = False,
+    ) -> Estimate:
+        """``any_pose``: it may lie any way."""
         shown: tuple[Evidence, ...] = ()
         if not len(cloud.points_mm) and pieces:
             alone, shown, pieces = touched(pieces, self.model.parts[0])
             looks = (Look(replace(alone, stamp_ns=cloud.stamp_ns), cloud, HERE),)
 
         def located(looks: Sequence[Look]) -> Estimate:
-            found = self._locator.locate(looks, grid, seed, pieces)
+            found = self._locator.locate(looks, grid, seed, pieces, any_pose)
             return self._judged(_told(found, shown), looks, False)
 
         with self._explaining_errors(looks, _DEFAULTS, bool(pieces)):
@@ -213,6 +242,48 @@ class Tracker:
     def warm(self) -> None:
         """Load and compile what the first call of ``follow`` would otherwise wait for."""
         self._locator.warm()
+
+
+def _shifted(estimate: Estimate, by_mm: Float64[np.ndarray, " 3"]) -> Estimate:
+    """All of it moved, without a turn."""
+    pose = rigid(np.eye(3), by_mm)
+    made, report = _seen_from(estimate, pose), estimate.report
+
+    def moved(places: Any) -> Any:
+        return (np.array(places) + by_mm).tolist()
+
+    parts = {
+        name: msgspec.structs.replace(
+            part, center_mm=moved(part.center_mm), box_mm=moved(part.box_mm)
+        )
+        for name, part in report.parts.items()
+    }
+    evidence = tuple(
+        msgspec.structs.replace(each, places_mm=moved(each.places_mm)) for each in report.evidence
+    )
+    motion, cost, volume = report.motion, report.fit_cost, estimate.volume
+    if motion is not None:
+        camera_from_ct = (pose @ np.array(motion.camera_from_ct)).tolist()
+        motion = msgspec.structs.replace(motion, camera_from_ct=camera_from_ct)
+    if cost is not None:
+        others = tuple(
+            msgspec.structs.replace(
+                other, center_mm={name: moved(place) for name, place in other.center_mm.items()}
+            )
+            for other in cost.others
+        )
+        cost = msgspec.structs.replace(cost, others=others)
+    if volume is not None:
+        volume = replace(volume, camera_from_index=pose @ volume.camera_from_index)
+    advice = tuple(
+        msgspec.structs.replace(each, place_mm=moved(each.place_mm))
+        for each in estimate.assessment.next_evidence
+    )
+    structures = {
+        name: mesh.moved(mesh.vertices_mm + by_mm) for name, mesh in estimate.structures.items()
+    }
+    made = replace(made, volume=volume, structures=structures).assessed(next_evidence=advice)
+    return made.reporting(parts=parts, evidence=evidence, motion=motion, fit_cost=cost)
 
 
 def _told(estimate: Estimate, shown: Sequence[Evidence]) -> Estimate:
