@@ -250,9 +250,12 @@ def touched(
     for number, (each, places) in enumerate(zip(mine, counts, strict=True)):
         tool = each.tool or f"piece {number}"
         shared[tool] = shared.get(tool, 0.0) + each.shared_std_mm * places / count
-    std_mm = float(np.sqrt(np.average([each.std_mm**2 for each in mine], weights=counts)))
-    mean_mm = float(np.linalg.norm([std_mm / count**0.5, *shared.values()]))
-    noise = PointNoise(std_mm, std_mm, mean_mm)
+    shift_mm = float(np.linalg.norm([*shared.values()]))
+    # What one tool shares moves all; what several do not share is noise.
+    squares_mm2 = [each.std_mm**2 + each.shared_std_mm**2 for each in mine]
+    std_mm = float(np.sqrt(max(np.average(squares_mm2, weights=counts) - shift_mm**2, 0.0)))
+    std_mm = max(std_mm, min(each.std_mm for each in mine))
+    noise = PointNoise(std_mm, std_mm, std_mm / count**0.5, shift_mm)
     cloud = SensorCloud(places_mm.astype(np.float32), noise=noise, depth_error=DepthError())
     return cloud, tuple(mine), tuple(each for each in evidence if each not in mine)
 

@@ -240,12 +240,13 @@ class DepthFrame:
 
 class PointNoise(NamedTuple):
     """Standard deviations, mm, along the line of sight: of what was measured; of a point, of which
-    neighbours' white noise may be averaged away; and of the mean of all points of a look, as what
-    neighbours share does not average out."""
+    neighbours' white noise may be averaged away; of the mean of all points of a look, as what
+    neighbours share does not average out; and of a shift of all points, along any axis."""
 
     measured_mm: float = 0.0
     point_mm: float = 0.0
     mean_mm: float = 0.0
+    shift_mm: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

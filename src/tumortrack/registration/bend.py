@@ -83,6 +83,7 @@ def bend(fit: RegistrationResult, config: GaussNewtonConfig) -> BentFit:
         at = at.moved_by(looks, precision, config, scale)
     count = len(precision)  # the rest are the cameras' errors
     covariance = np.linalg.inv(at.curvature)[:count, :count]
+    covariance[:3, :3] += looks.noise.shift_mm**2 * np.eye(3)
     motion = replace(at.motion, covariance=covariance, rivals=fit.motion.rivals)
     return BentFit(
         motion=motion,

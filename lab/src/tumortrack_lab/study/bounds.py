@@ -17,6 +17,7 @@ from scipy.stats import spearmanr
 
 from tumortrack.assessment.advice import advise
 from tumortrack.assessment.bound import (
+    CONFIDENCE,
     POOR_MM,
     BoundModel,
     Quantile,
@@ -37,11 +38,10 @@ from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.world.evidence import ALL_TRUE, ERRORS, EvidenceSource, hidden
 
 Generator = np.random.Generator
-_CONFIDENCE = 0.95
 _LEAST_MM, _LOST_MM = 0.1, 30.0  # misses: less is noise; more are other minima, which fits refuse
-_KNOTS = (0.02, 0.5, 0.85)  # quantiles of a figure from which it counts
-_SMOOTH_MM = 0.05  # of the pinball's corner, so that its slope is one
-_RIDGE = 1e-3  # pulls weights that tell nothing to 0
+_KNOTS = (0.02,)  # quantiles of a figure from which it counts; more fit no better what is left out
+_SMOOTH = 0.05  # of the pinball's corner, so that its slope is one
+_RIDGE = 1e-2  # pulls weights that tell nothing to 0
 _VERTICES = 300  # of a part, where its miss is measured
 _ANSWER = ["organ", "scene", "answer"]
 _ABOUT = {
@@ -226,30 +226,32 @@ def learned(
 
 
 def quantile_of(rows: pd.DataFrame) -> Quantile:
-    """The weights of the least pinball loss, then the constant under which 95 % of the misses lie
+    """The weights of the least pinball loss of the logarithm, then the constant under which 95 % lie
     within the bound, each family of physics counting alike: of answers that nothing else speaks
     against."""
     calm = rows[_acceptable(rows) & (rows.miss_mm < _LOST_MM)]
     names = [name for name in rows.columns if name not in _ABOUT]
     knots = [(name, float(k)) for name in names for k in np.unique(calm[name].quantile(_KNOTS))]
     values = np.column_stack([(calm[name] - knot).clip(lower=0) for name, knot in knots])
-    misses_mm = calm.miss_mm.clip(lower=_LEAST_MM).to_numpy()
+    logs = np.log(calm.miss_mm.clip(lower=_LEAST_MM).to_numpy())
     share = (1 / calm.groupby("family").miss_mm.transform("size")).to_numpy()
     share = share / share.sum()
 
-    def loss(unknowns: Float[np.ndarray, " w"]) -> tuple[float, Float[np.ndarray, " w"]]:
-        bounds_mm = np.exp(np.minimum(unknowns[0] + values @ unknowns[1:], 5.0))
-        over = (misses_mm - bounds_mm) / _SMOOTH_MM
-        steep = 1 / (1 + np.exp(-np.clip(over, -50, 50)))
-        pinball = (_CONFIDENCE - 1) * over + np.logaddexp(0, np.clip(over, -700, 700))
-        slope = -share * bounds_mm * (_CONFIDENCE - 1 + steep)
-        gradient = np.append(slope.sum(), values.T @ slope + 2 * _RIDGE * unknowns[1:])
-        return float(share @ pinball * _SMOOTH_MM + _RIDGE * (unknowns[1:] ** 2).sum()), gradient
+    spread = values.std(0)
 
-    first = np.append(np.log(np.quantile(misses_mm, _CONFIDENCE)), np.zeros(len(knots)))
+    def loss(unknowns: Float[np.ndarray, " w"]) -> tuple[float, Float[np.ndarray, " w"]]:
+        over = (logs - unknowns[0] - values @ unknowns[1:]) / _SMOOTH
+        steep = 1 / (1 + np.exp(-np.clip(over, -50, 50)))
+        pinball = (CONFIDENCE - 1) * over + np.logaddexp(0, over)
+        slope = -share * (CONFIDENCE - 1 + steep)
+        ridge = _RIDGE * spread**2 * unknowns[1:]
+        gradient = np.append(slope.sum(), values.T @ slope + 2 * ridge)
+        return float(share @ pinball * _SMOOTH + ridge @ unknowns[1:]), gradient
+
+    first = np.append(np.quantile(logs, CONFIDENCE), np.zeros(len(knots)))
     limits = [(None, None), *[(0.0, None)] * len(knots)]
     best = minimize(loss, first, jac=True, bounds=limits, method="L-BFGS-B").x
-    left = np.log(misses_mm) - values @ best[1:]
+    left = logs - values @ best[1:]
     constant = _weighted_quantile(left, share)
     hinges: dict[str, list[tuple[float, float]]] = {}
     for (name, knot), weight in zip(knots, best[1:], strict=True):
@@ -262,7 +264,7 @@ def quantile_of(rows: pd.DataFrame) -> Quantile:
 def _weighted_quantile(values: np.ndarray, share: np.ndarray) -> float:
     order = np.argsort(values)
     below = np.cumsum(share[order])
-    rank = min(int(np.searchsorted(below, _CONFIDENCE * (1 + 1 / len(values)))), len(values) - 1)
+    rank = min(int(np.searchsorted(below, CONFIDENCE * (1 + 1 / len(values)))), len(values) - 1)
     return float(values[order][rank])
 
 
