@@ -125,6 +125,8 @@ def advice_rows(tracker: Tracker, scene: Scene, seed: int) -> Iterator[dict[str,
         before = tracker.locate(scene.cloud, 8, 0)
     except NoEstimate:
         return
+    if before.finding is not None and before.finding.kind not in FAR_OFF:
+        return  # then none is shown
     tumors, bounds = before.report.tumors, before.assessment.bounds
     part = max(tumors, key=lambda name: bounds[name].error_bound95_mm)
     advice = advise(before, part)
