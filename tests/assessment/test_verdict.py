@@ -293,9 +293,10 @@ def test_locate_says_its_verdict_and_plan_heeds_it(tmp_path, phantom_case, clini
     page = (run / "index.html").read_text()
     assert f"<h1>{quality['verdict'].upper()}</h1>" in page
     manifest = store.read_json(run / store.MANIFEST)
-    for verdict, reason in (("good", ""), ("poor", "the organ hides")):
+    hides = {"kind": "model", "values": {"words": "the organ hides"}}
+    for verdict, finding in (("good", None), ("poor", hides)):
         report = store.read_json(run / "report.json")
-        report["quality"] = {"verdict": verdict, "reason": reason}
+        report["assessment"] |= {"finding": finding, "advice": ""}
         store.write_json(run / "report.json", report)
         manifest["files"]["report.json"] = store.sha256_of(run / "report.json")
         store.write_json(run / store.MANIFEST, manifest)
