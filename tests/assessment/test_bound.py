@@ -16,6 +16,7 @@ from tumortrack.assessment.bound import (
     BoundModel,
     Quantile,
     bounds_of,
+    elsewhere_mm,
     figures,
     shipped,
 )
@@ -32,6 +33,31 @@ from warp_objects import ANATOMY, placed
 def estimate(slim_model):
     cloud = visible()
     return Tracker(load_model(slim_model, "cpu")).locate(cloud, 16, 0)
+
+
+@pytest.fixture
+def one_place(monkeypatch):
+    """An ellipsoid fits as well turned by half a turn, which is not what these tests are about."""
+    monkeypatch.setattr(bound, "elsewhere_mm", lambda report, name: 0.0)
+
+
+def test_other_places_that_are_as_likely_are_within_the_bound(estimate):
+    cost = estimate.report.fit_cost
+    (other,) = cost.others[:1]
+    for chances, expected_mm in (((0.04,), 0.0), ((0.06,), 40.0), ((0.03, 0.03), 25.0)):
+        others = [
+            {"more": 1.0, "apart_mm": {"tumor_1": mm}, "share": chance}
+            for chance, mm in zip(chances, (40.0, 25.0), strict=False)
+        ]
+        told = reporting(estimate, fit_cost={"others": others, **FIT})
+        assert elsewhere_mm(told.report, "tumor_1") == expected_mm
+        bound_mm = bounds_of(told.report)["tumor_1"].error_bound95_mm
+        assert bound_mm >= expected_mm
+    assert other.turn_degrees > 150
+    assert 0.05 < other.share < 0.6
+
+
+FIT = {"now": 10.0, "without_strays": 10.0, "usual": 20.0, "strays": 0.0}
 
 
 def visible():
@@ -69,7 +95,8 @@ def test_a_figure_counts_from_its_knots_on():
         assert model.bound_mm({"cost": cost}) == pytest.approx(expected)
 
 
-def test_an_answer_says_how_far_off_its_tumors_may_be(estimate):
+def test_an_answer_says_how_far_off_its_tumors_may_be(slim_model, one_place):
+    estimate = Tracker(load_model(slim_model, "cpu")).locate(visible(), 16, 0)
     bounds, tumor = estimate.assessment.bounds, estimate.report.parts["tumor_1"]
     assert [*bounds] == ["kidney", "tumor_1"]
     assert bounds["tumor_1"].least_sure == tumor.center_axes[0]
@@ -83,7 +110,7 @@ def test_an_answer_says_how_far_off_its_tumors_may_be(estimate):
     assert known["nearest"] == pytest.approx(math.log(tumor.nearest_mm))
 
 
-def test_a_miss_that_may_be_large_makes_an_answer_poor(slim_model, monkeypatch):
+def test_a_miss_that_may_be_large_makes_an_answer_poor(slim_model, one_place, monkeypatch):
     tracker = Tracker(load_model(slim_model, "cpu"))
     cases = (POOR_MM - 0.1, 0.0, None), (POOR_MM + 0.1, 0.0, "miss"), (2.0, 10.0, "depths")
     for radius_mm, depth_mm, kind in cases:
@@ -94,7 +121,7 @@ def test_a_miss_that_may_be_large_makes_an_answer_poor(slim_model, monkeypatch):
         assert (None if found is None else found.kind) == kind
 
 
-def test_a_factor_multiplies_the_bound_and_so_decides(slim_model, monkeypatch):
+def test_a_factor_multiplies_the_bound_and_so_decides(slim_model, one_place, monkeypatch):
     model = load_model(slim_model, "cpu")
     plain = of_radius(0.8 * POOR_MM)
     monkeypatch.setattr(bound, "shipped", lambda: plain)

@@ -105,7 +105,8 @@ def foreseen_mm(report: FitReport, advice: NextEvidence) -> float | None:
     less = math.log(advice.then_std_mm / advice.std_mm)
     then = {name: known[name] + less for name in ("center_std", "surface_std")}
     bound_mm = shipped().tumor.bound_mm({**known, **then})
-    return math.hypot(bound_mm, depths_within_mm(report, advice.part))
+    bound_mm = math.hypot(bound_mm, depths_within_mm(report, advice.part))
+    return max(bound_mm, elsewhere_mm(report, advice.part))
 
 
 def elsewhere_mm(report: FitReport, name: str) -> float:

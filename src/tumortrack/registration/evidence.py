@@ -129,11 +129,13 @@ class EvidenceTerms:
     shared_mm: Float64[np.ndarray, " tools"]  # its deviation
 
     @classmethod
-    def of(cls, evidence: Sequence[Evidence], parts: Sequence[str]) -> EvidenceTerms | None:
+    def of(
+        cls, evidence: Sequence[Evidence], parts: Sequence[str], most: float = _MOST
+    ) -> EvidenceTerms | None:
         """``parts``: names of what can be touched (``Anatomy.closed``). None: there is no evidence.
         Raises InputError: of a part that the organ lacks, or that is open; too many places."""
-        if (count := sum(len(each.places) for each in evidence)) > _MOST:
-            raise InputError(f"evidence has {count} places; allowed: up to {_MOST}. Thin it out.")
+        if (count := sum(len(each.places) for each in evidence)) > most:
+            raise InputError(f"evidence has {count} places; allowed: up to {most}. Thin it out.")
         surfaces, points = list[tuple[Any, ...]](), list[tuple[Any, ...]]()
         tools = dict[str, float]()
         for number, each in enumerate(evidence):

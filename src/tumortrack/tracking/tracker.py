@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -291,7 +292,7 @@ def _told(estimate: Estimate, shown: Sequence[Evidence]) -> Estimate:
     motion = estimate.motion
     if not shown or not isinstance(motion, ElasticMotion):
         return estimate
-    terms = EvidenceTerms.of(shown, motion.shape.anatomy_ct.names)
+    terms = EvidenceTerms.of(shown, motion.shape.anatomy_ct.names, math.inf)
     assert terms is not None
     told = terms.described(shown, motion, 0, terms.at(motion))
     return estimate.reporting(evidence=(*told, *estimate.report.evidence))
