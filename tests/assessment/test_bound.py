@@ -46,7 +46,7 @@ def test_other_places_that_are_as_likely_are_within_the_bound(estimate):
     (other,) = cost.others[:1]
     for chances, expected_mm in (((0.04,), 0.0), ((0.06,), 40.0), ((0.03, 0.03), 25.0)):
         others = [
-            {"more": 1.0, "apart_mm": {"tumor_1": mm}, "share": chance}
+            {"more": 1.0, "apart_mm": {"kidney": 9.0, "tumor_1": mm}, "share": chance}
             for chance, mm in zip(chances, (40.0, 25.0), strict=False)
         ]
         told = reporting(estimate, fit_cost={"others": others, **FIT})

@@ -425,7 +425,9 @@ def test_touches_alone_are_an_answer(slim_model, tmp_path):
     report = json.loads((out / "report.json").read_text())
     assert report["points"] == 40
     assert report["cloud_sha256"] is None
-    assert [each["name"] for each in report["evidence"]] == ["landmark"] * 2
+    told = report["evidence"]
+    assert [each["name"] for each in told] == ["touch"] * 40 + ["landmark"] * 2
+    assert not any(each["left_out"] for each in told)
     found_mm = np.array(report["parts"]["tumor_1"]["center_mm"])
     assert np.linalg.norm(found_mm - at_all(TUMOR).mean(0)) < 3
     file.write_bytes(evidence_json(tuple(evidence[:11])))
@@ -461,6 +463,60 @@ def test_outlines_alone_are_an_answer_and_their_stated_error_counts(slim_model):
     assert stds[0.3, 3.0] > 2 * stds[0.3, 0.0]
 
 
+def shifted(pieces, by_mm):
+    return [each.at(np.array(each.places) + by_mm, each.std_mm) for each in pieces]
+
+
+def test_in_a_frame_of_its_own_evidence_has_its_answer_there(slim_model, tmp_path):
+    nothing, away_mm = SensorCloud(np.zeros((0, 3))), np.array([400.0, -250.0, -300.0])
+    told = [*planes(12), *this_way_round()]
+    tracker = Tracker(load_model(slim_model, "cpu"))
+    here = tracker.locate(nothing, 16, 0, evidence=told)
+    there = tracker.locate(nothing, 16, 0, None, shifted(told, away_mm), "tracker")
+    for place in ("center_mm", "box_mm"):
+        a, b = (np.array(getattr(f.report.parts["tumor_1"], place)) for f in (here, there))
+        np.testing.assert_allclose(b - a, np.broadcast_to(away_mm, a.shape), atol=0.3)
+    moved = there.motion.carry(VERTICES) - here.motion.carry(VERTICES)
+    np.testing.assert_allclose(moved, np.tile(away_mm, (len(VERTICES), 1)), atol=0.5)
+    off_mm = there.meshes["kidney"].vertices_mm - there.motion.carry(VERTICES)
+    assert np.abs(off_mm).max() < 0.1
+    for a, b in zip(there.report.evidence, shifted(told, away_mm), strict=True):
+        np.testing.assert_allclose(a.places_mm, b.places, atol=1e-6)
+    with pytest.raises(InputError, match="camera's frame"):
+        tracker.locate(SensorCloud(SEEN), 16, 0, None, told, "tracker")
+    file, out = tmp_path / "e.json", tmp_path / "out"
+    content = json.loads(evidence_json(tuple(shifted(told, away_mm))))
+    file.write_text(json.dumps({**content, "frame": "tracker"}))
+    options = "--grid", 32, "--device", "cpu", "--evidence", file
+    answered(tumortrack("locate", slim_model, "-", out, *options))
+    assert json.loads((out / "report.json").read_text())["frame"] == "tracker"
+    assert json.loads((out / "manifest.json").read_text())["frame"] == "tracker"
+
+
+def test_one_wrong_plane_of_many_is_named_and_moves_nothing(slim_model):
+    tracker, nothing = Tracker(load_model(slim_model, "cpu")), SensorCloud(np.zeros((0, 3)))
+    told = [*planes(12), *this_way_round()]
+    right = tracker.locate(nothing, 16, 0, evidence=told)
+    told[4:5] = shifted(told[4:5], [0, 0, 22.0])
+    found = tracker.locate(nothing, 16, 0, evidence=told)
+    assert [n for n, each in enumerate(found.report.evidence) if each.left_out] == [4]
+    assert found.report.evidence[4].off_mm > 10
+    away_mm = found.motion.carry(VERTICES) - right.motion.carry(VERTICES)
+    assert np.linalg.norm(away_mm, axis=1).mean() < 1.0
+
+
+def test_what_is_as_likely_the_other_way_round_is_said_with_its_place(slim_model):
+    """Nothing tells which way round an ellipsoid lies."""
+    tracker, nothing = Tracker(load_model(slim_model, "cpu")), SensorCloud(np.zeros((0, 3)))
+    found = tracker.locate(nothing, 16, 0, evidence=planes(12))
+    others, tumor = found.report.fit_cost.others, np.array(found.report.parts["tumor_1"].center_mm)
+    places = [tumor, *(np.array(each.center_mm["tumor_1"]) for each in others)]
+    assert min(np.linalg.norm(place - at_all(TUMOR).mean(0)) for place in places) < 3
+    assert max(each.turn_degrees for each in others) > 170
+    assert 0.05 < sum(each.share for each in others) < 1
+    assert found.quality == "poor"
+
+
 def test_what_is_older_than_the_organs_last_motion_is_refused(tmp_path):
     old = Touch(place_mm=(0.0, 0.0, 150.0), stamp_ns=5)
     content = {**json.loads(evidence_json((old,))), "still_since_ns": 6}
@@ -473,7 +529,7 @@ def test_the_command_takes_a_file_and_says_what_is_wrong_with_it(slim_model, tmp
     write_cloud_ply(tmp_path / "cloud.ply", SEEN.astype(np.float32))
     file, out = tmp_path / "e.json", tmp_path / "out"
     command = "locate", slim_model, tmp_path / "cloud.ply", out, "--grid", 32, "--device", "cpu"
-    content = json.loads(evidence_json(tuple(touches(6))))
+    content = json.loads(evidence_json((*touches(6), *this_way_round())))
     wrong = {
         "frame 'robot'": {**content, "frame": "robot"},
         "unit 'm'": {**content, "unit": "m"},
@@ -489,13 +545,16 @@ def test_the_command_takes_a_file_and_says_what_is_wrong_with_it(slim_model, tmp
     file.write_text(json.dumps(content))
     said = answered(tumortrack(*command, "--evidence", file))
     assert "touch 6: " in said
-    assert "next, touch the organ at" in said  # only how far off the tumor may be speaks against it
+    told = json.loads((out / "report.json").read_text())["assessment"]
+    assert ("next, " in said) == bool(told.get("next_evidence"))
     report = json.loads((out / "report.json").read_text())
-    assert [each["name"] for each in report["evidence"]] == ["touch"] * 6
+    assert [each["name"] for each in report["evidence"]] == ["touch"] * 6 + ["landmark"] * 2
     assert len(report["evidence_sha256"]) == 64
     advise = "--overwrite", "--advise"
     said = answered(tumortrack(*command, "--evidence", file, *advise, "kidney"))
-    assert re.search(r"next, touch the organ at .*: kidney ", said)
+    told = json.loads((out / "report.json").read_text())["assessment"].get("next_evidence", [])
+    assert {each["part"] for each in told} <= {"kidney"}
+    assert ("next, " in said) == bool(told)
     assert "allowed: kidney, tumor_1" in refusal(tumortrack(*command, *advise, "cyst"))
     away = [{**content["evidence"][0], "place_mm": [0.0, 0.0, 400.0]}]
     file.write_text(json.dumps({**content, "evidence": away}))

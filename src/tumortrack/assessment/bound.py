@@ -100,11 +100,12 @@ def foreseen_mm(report: FitReport, advice: NextEvidence) -> float | None:
     """The bound of the part that a piece of evidence is for, once that is known, without a factor;
     None: not known. What it does not narrow stays."""
     known = figures(report, advice.part)
-    if known is None or advice.part not in report.tumors:
+    if known is None:
         return None
     less = math.log(advice.then_std_mm / advice.std_mm)
     then = {name: known[name] + less for name in ("center_std", "surface_std")}
-    bound_mm = shipped().tumor.bound_mm({**known, **then})
+    quantile = shipped().tumor if advice.part in report.tumors else shipped().organ
+    bound_mm = quantile.bound_mm({**known, **then})
     bound_mm = math.hypot(bound_mm, depths_within_mm(report, advice.part))
     return max(bound_mm, elsewhere_mm(report, advice.part))
 

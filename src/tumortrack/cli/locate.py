@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from tumortrack.report.locating import Located
 
 
+_MOST_SAID = 12  # pieces of evidence that agree: of more, their number alone
+
+
 @dataclass(frozen=True, kw_only=True)
 class Locate(LocateOptions):
     """Locate organ and tumors in one cloud or depth image, or in several of the organ at rest.
@@ -89,8 +92,12 @@ def _say_estimate(estimate: Estimate, located: Located) -> None:
     say(str(estimate.patient))
     for row in part_rows(report, estimate.assessment):
         say(row_words(row))
+    agree = sum(not each.left_out for each in report.evidence)
     for number, each in enumerate(report.evidence, start=1):
-        say(f"{each.name} {number}: {each.off_mm:.1f} mm off{', left out' * each.left_out}")
+        if each.left_out or agree <= _MOST_SAID:
+            say(f"{each.name} {number}: {each.off_mm:.1f} mm off{', left out' * each.left_out}")
+    if agree > _MOST_SAID:
+        say(f"{agree} pieces of evidence agree with the answer")
     for line in alternative_lines(estimate):
         say(line)
     for line in next_lines(estimate):
