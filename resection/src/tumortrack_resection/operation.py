@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
-from tumortrack.assessment.advice import advise
+from tumortrack.assessment.advice import advise, worthwhile
 from tumortrack.core.colours import CUT, ENERGISED, NOW, TO_CUT
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
@@ -213,7 +213,8 @@ class Operation:
             return reaches(there_mm, table_from_camera[:3, :3] @ normal)
 
         advice = advise(estimate, self.planned.plan.tumor, reach)
-        return estimate.assessed(next_evidence=advice)
+        worth = worthwhile(estimate.report, advice, estimate.assessment.factor)
+        return estimate.assessed(next_evidence=worth)
 
     def evidence(self, camera_from_published: Affine, stamp_ns: int) -> tuple[Evidence, ...]:
         """Where the holder has the tissue that it grips, in a frame of the camera."""

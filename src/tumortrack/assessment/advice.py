@@ -41,7 +41,8 @@ def advise(estimate: Estimate, part: str, reach: Reach | None = None) -> tuple[N
     if not isinstance(motion, ElasticMotion) or motion.covariance is None:
         raise InputError("advice needs a model that knows a motion: give the case itself.")
     advisor = Advisor(motion, part_number(part, motion.shape.anatomy_ct.names))
-    return *advisor.touches(reach=reach), *advisor.others()
+    advice = *advisor.touches(reach=reach), *advisor.others()
+    return with_bounds(estimate.report, advice, estimate.assessment.factor)
 
 
 def worthwhile(
@@ -49,17 +50,27 @@ def worthwhile(
 ) -> tuple[NextEvidence, ...]:
     """The advice that pays: what lowers a bound by over a third of a millimetre, of kinds whose
     foreseen gains were found in scenes left out. ``factor``: of the bounds."""
-    now = bounds_of(report)
-    kept, kinds = list[NextEvidence](), shipped().advice
+    kinds = shipped().advice
+    return tuple(
+        each
+        for each in with_bounds(report, advice, factor)
+        if _FOUND[0] <= kinds.get(each.kind, 0.0) <= _FOUND[1]
+        and each.bound_mm - each.then_bound_mm > _LEAST_GAIN_MM
+    )
+
+
+def with_bounds(
+    report: FitReport, advice: Sequence[NextEvidence], factor: float
+) -> tuple[NextEvidence, ...]:
+    """The advice with the bound that it would lower, as far as that is known."""
+    now, told = bounds_of(report), list[NextEvidence]()
     for each in advice:
-        then_mm = foreseen_mm(report, each)
-        if then_mm is None or not _FOUND[0] <= kinds.get(each.kind, 0.0) <= _FOUND[1]:
+        if (then_mm := foreseen_mm(report, each)) is None:
+            told.append(each)
             continue
-        bound_mm = factor * now[each.part].error_bound95_mm
-        if bound_mm - factor * then_mm > _LEAST_GAIN_MM:
-            told = {"bound_mm": bound_mm, "then_bound_mm": factor * then_mm}
-            kept.append(msgspec.structs.replace(each, **told))
-    return tuple(kept)
+        bounds = {"bound_mm": factor * now[each.part].error_bound95_mm}
+        told.append(msgspec.structs.replace(each, **bounds, then_bound_mm=factor * then_mm))
+    return tuple(told)
 
 
 def where_to_look(estimate: Estimate, looks: Sequence[Look], hides: bool = True) -> str:

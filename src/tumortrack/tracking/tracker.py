@@ -142,14 +142,14 @@ class Tracker:
         any_pose: bool = False,
     ) -> Estimate:
         """``any_pose``: it may lie any way."""
-        shown: tuple[Evidence, ...] = ()
+        shown, given = tuple[Evidence, ...](), pieces
         if not len(cloud.points_mm) and pieces:
             alone, shown, pieces = touched(pieces, self.model.parts[0])
             looks = (Look(replace(alone, stamp_ns=cloud.stamp_ns), cloud, HERE),)
 
         def located(looks: Sequence[Look]) -> Estimate:
             found = self._locator.locate(looks, grid, seed, pieces, any_pose)
-            return self._judged(_told(found, shown), looks, False)
+            return self._judged(_told(found, shown, given), looks, False)
 
         with self._explaining_errors(looks, _DEFAULTS, bool(pieces)):
             estimate, looks = likeliest_piece(looks, located)
@@ -287,15 +287,18 @@ def _shifted(estimate: Estimate, by_mm: Float64[np.ndarray, " 3"]) -> Estimate:
     return made.reporting(parts=parts, evidence=evidence, motion=motion, fit_cost=cost)
 
 
-def _told(estimate: Estimate, shown: Sequence[Evidence]) -> Estimate:
-    """The estimate with what it says of evidence that was its cloud."""
+def _told(estimate: Estimate, shown: Sequence[Evidence], given: Sequence[Evidence]) -> Estimate:
+    """The estimate with what it says of evidence that was its cloud, in the order of all that was
+    ``given``."""
     motion = estimate.motion
     if not shown or not isinstance(motion, ElasticMotion):
         return estimate
     terms = EvidenceTerms.of(shown, motion.shape.anatomy_ct.names, math.inf)
     assert terms is not None
     told = terms.described(shown, motion, 0, terms.at(motion))
-    return estimate.reporting(evidence=(*told, *estimate.report.evidence))
+    rest, mine = iter(estimate.report.evidence), iter(told)
+    order = [any(each is piece for piece in shown) for each in given]
+    return estimate.reporting(evidence=tuple(next(mine if was else rest) for was in order))
 
 
 def _parted(
