@@ -27,9 +27,12 @@ def main(out: Path) -> None:
     estimate = tracker.locate(cloud, grid=48)
     tell("no touch", estimate, scene.targets)
     for _ in range(2):
-        for advised in estimate.assessment.next_evidence:  # camera frame, mm
+        bounds = estimate.assessment.bounds
+        least_sure = max(estimate.report.tumors, key=lambda n: bounds[n].error_bound95_mm)
+        advice = tt.advise(estimate, least_sure)  # estimate.assessment has what pays
+        for advised in advice:  # camera frame, mm
             print(f"next, {advised.words}")
-        for advised in estimate.assessment.next_evidence:
+        for advised in advice:
             if advised.kind == "touch":  # the tip meets the true surface near there
                 away_mm = np.linalg.norm(vertices_mm - advised.place_mm, axis=1)
                 place_mm = vertices_mm[away_mm.argmin()] + rng.normal(0, ERROR_MM, 3)

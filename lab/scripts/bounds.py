@@ -72,12 +72,18 @@ def main(options: Options) -> None:
                 advance()
     rows = _read([_rows_path(options.out, number, states) for _, number, states in organs])
     rows = rows[rows.segmentation_mm <= bounds.READERS_MM]
-    asked = ({"part": "organ", "by": "family"}, {"part": "organ", "by": "shape"},
-             {"part": "family"}, {"part": "evidence"}, {"part": "shape"})  # fmt: skip
-    tables = [bounds.left_out(rows, **each).astype(object).fillna(NOTHING) for each in asked]
+    organs_out, *others_out = (
+        bounds.bounded(rows, part) for part in ("organ", "family", "evidence", "shape")
+    )
+    ways = (organs_out, "family"), (organs_out, "shape"), *zip(
+        others_out, ("family", "evidence", "shape"), strict=True
+    )  # fmt: skip
+    tables = [bounds.left_out(*way).astype(object).fillna(NOTHING) for way in ways]
+    if options.document is not None:
+        bounds.draw(organs_out, writer.image("bounds"))
     print(*map(table_of, tables), sep="\n\n")
-    named = [table.rename(columns={table.columns[0]: "left out"}) for table in tables[2:]]
-    written = {_BLOCK: pd.concat(tables[:2]), f"{_BLOCK}-left-out": pd.concat(named)}
+    named = [table.rename(columns={table.columns[0]: "of"}) for table in tables]
+    written = {_BLOCK: pd.concat(named[:2]), f"{_BLOCK}-left-out": pd.concat(named[2:])}
     about = {"organs": len(organs)}
     if options.write is not None:
         store.write_json(options.write, to_builtins(bounds.learned(rows, about)))

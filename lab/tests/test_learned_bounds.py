@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from tumortrack_lab.study.bounds import learned, left_out, quantile_of
+from tumortrack_lab.study.bounds import bounded, learned, left_out, quantile_of
 
 TRUE = {"center_std": 0.8, "nearest": 0.4, "cost": 0.0}
 
@@ -69,20 +69,22 @@ def test_families_count_alike_however_many_answers_they_have():
 
 
 def test_each_part_is_judged_by_what_was_learned_from_the_others():
-    table = left_out(rows(4), "organ").set_index("organ")
+    table = left_out(bounded(rows(4), "organ"), "organ").set_index("organ")
     assert list(table.index) == [0, 1, 2, 3, 4, "all"]
     assert table["within the bound %"].between(91, 98.5).all()
     assert table.loc["all", "rank correlation"] == pytest.approx(0.8, abs=0.1)
-    by_family = left_out(rows(4), "organ", by="family").set_index("family")
+    by_family = left_out(bounded(rows(4), "organ"), "family").set_index("family")
     assert list(by_family.index) == ["pull", "rest", "all"]
     assert (by_family["rigid fit: median"] == 2.0).all()
     assert by_family.loc["all", "answers"] == table.loc["all", "answers"]
 
 
 def test_an_answer_is_good_if_all_its_tumors_are_near():
-    one, sure = rows(6), left_out(rows(6), "organ").iloc[-1]["good %"]
+    one, sure = rows(6), left_out(bounded(rows(6), "organ"), "organ").iloc[-1]["good %"]
     far = one.assign(center_std=9.0, miss_mm=one.miss_mm * np.exp(0.8 * (9.0 - one.center_std)))
-    both = left_out(pd.concat([one, far], ignore_index=True), "organ").iloc[-1]["good %"]
+    both = left_out(bounded(pd.concat([one, far], ignore_index=True), "organ"), "organ").iloc[-1][
+        "good %"
+    ]
     assert sure > 20
     assert both == 0
 

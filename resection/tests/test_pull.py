@@ -348,7 +348,7 @@ def test_arms_that_stand_advise_touches_that_they_reach(pulled, monkeypatch):
             Planned(PLAN, meshes, standing), OperationConfig(), lambda joints_rad: (), live
         )
 
-    monkeypatch.setattr(bound, "elsewhere_mm", lambda report, name: 0.0)  # of an ellipsoid
+    monkeypatch.setattr(bound, "alternatives_mm", lambda report, name: 0.0)  # of an ellipsoid
     monkeypatch.setattr(advice_module, "_LEAST_GAIN_MM", 0.0)  # the organ is seen well
     update = replace(seen(), estimate=estimate)
     acting = operation(config)

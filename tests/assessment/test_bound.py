@@ -15,8 +15,8 @@ from tumortrack.assessment.bound import (
     POOR_MM,
     BoundModel,
     Quantile,
+    alternatives_mm,
     bounds_of,
-    elsewhere_mm,
     figures,
     shipped,
 )
@@ -38,7 +38,7 @@ def estimate(slim_model):
 @pytest.fixture
 def one_place(monkeypatch):
     """An ellipsoid fits as well turned by half a turn, which is not what these tests are about."""
-    monkeypatch.setattr(bound, "elsewhere_mm", lambda report, name: 0.0)
+    monkeypatch.setattr(bound, "alternatives_mm", lambda report, name: 0.0)
 
 
 def test_other_places_that_are_as_likely_are_within_the_bound(estimate):
@@ -50,7 +50,7 @@ def test_other_places_that_are_as_likely_are_within_the_bound(estimate):
             for chance, mm in zip(chances, (40.0, 25.0), strict=False)
         ]
         told = reporting(estimate, fit_cost={"others": others, **FIT})
-        assert elsewhere_mm(told.report, "tumor_1") == expected_mm
+        assert alternatives_mm(told.report, "tumor_1") == expected_mm
         bound_mm = bounds_of(told.report)["tumor_1"].error_bound95_mm
         assert bound_mm >= expected_mm
     assert other.turn_degrees > 150

@@ -222,7 +222,7 @@ def test_structures_are_drawn_and_named(tmp_path):
 def test_the_page_shows_evidence_and_what_to_learn_next_where_the_organ_surely_lies(
     tmp_path, placed
 ):
-    place_mm, then_mm = [4.0, -3.0, 104.0], {"touch": 0.92, "look": 0.81}
+    place_mm, then_mm = [4.0, -3.0, 104.0], {"touch": 3.12, "look": 4.01}
     known = [
         {"name": "touch", "tool": "probe", "off_mm": 0.44, "news": 0.312, "left_out": False},
         {"name": "outline", "off_mm": 24.0, "news": 0.0, "left_out": True},
@@ -231,7 +231,8 @@ def test_the_page_shows_evidence_and_what_to_learn_next_where_the_organ_surely_l
     advice = [
         {
             "kind": kind, "part": "tumor_1", "place_mm": place_mm,
-            "direction": [0.0, 0.0, -1.0], "std_mm": 1.33, "then_std_mm": then_mm[kind],
+            "direction": [0.0, 0.0, -1.0], "std_mm": 1.33, "then_std_mm": 0.9,
+            "bound_mm": 5.26, "then_bound_mm": then_mm[kind],
         }
         for kind in ("touch", "touch", "touch", "look")
     ]  # fmt: skip
@@ -245,13 +246,9 @@ def test_the_page_shows_evidence_and_what_to_learn_next_where_the_organ_surely_l
         ">outline 2</th>", ">24.0 mm</td>", ">left out: it contradicts the rest</td>",
     ):  # fmt: skip
         assert cells in page
-    look, touch = (
-        f"Next, {words}: tumor_1 1.3 -&gt; {then} mm (one deviation; camera frame)"
-        for words, then in (
-            ("look from 4, -3, 104 mm as well", 0.8), ("touch the organ at 4, -3, 104 mm", 0.9),
-        )
-    )  # fmt: skip
-    assert (look in page, touch in page) == (placed, placed)
+    best = "Next, touch the organ at 4, -3, 104 mm: tumor_1 would be off by at most 3.1 mm"
+    assert (f"{best} instead of 5.3 (95 %)" in page) == placed
+    assert "look from 4" not in page  # one line
     assert "Dots: white, evidence in use" in page
     assert page.count("Next, touch") == placed  # of three touches the first alone
     with Image.open(tmp_path / PICTURE) as image:

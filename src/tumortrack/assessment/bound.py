@@ -107,10 +107,10 @@ def foreseen_mm(report: FitReport, advice: NextEvidence) -> float | None:
     quantile = shipped().tumor if advice.part in report.tumors else shipped().organ
     bound_mm = quantile.bound_mm({**known, **then})
     bound_mm = math.hypot(bound_mm, depths_within_mm(report, advice.part))
-    return max(bound_mm, elsewhere_mm(report, advice.part))
+    return max(bound_mm, alternatives_mm(report, advice.part))
 
 
-def elsewhere_mm(report: FitReport, name: str) -> float:
+def alternatives_mm(report: FitReport, name: str) -> float:
     """How far off a part's centre is at most (95 %) by other fits that are as likely."""
     rivals = () if report.fit_cost is None else report.fit_cost.others
     left = 1 - CONFIDENCE
@@ -129,6 +129,6 @@ def bounds_of(report: FitReport) -> dict[str, ErrorBound]:
         quantile = shipped().tumor if name in report.tumors else shipped().organ
         if (known := figures(report, name)) is not None:
             bound_mm = math.hypot(quantile.bound_mm(known), depths_within_mm(report, name))
-            bound_mm = max(bound_mm, elsewhere_mm(report, name))
+            bound_mm = max(bound_mm, alternatives_mm(report, name))
             bounds[name] = ErrorBound(bound_mm, part.center_axes and part.center_axes[0])
     return bounds

@@ -118,10 +118,10 @@ class Tracker:
         looks: Sequence[Look]
         looks, pieces = _parted(cloud, seen, evidence)
         if frame != CAMERA:
-            return self._elsewhere(cloud, pieces, grid, seed)
+            return self._located_in_frame(cloud, pieces, grid, seed)
         return self._located(cloud, looks, pieces, grid, seed)
 
-    def _elsewhere(
+    def _located_in_frame(
         self, cloud: SensorCloud, pieces: Sequence[Evidence], grid: int, seed: int
     ) -> Estimate:
         """By evidence alone in any frame: as if a camera, which could lie any way, saw it."""
@@ -149,7 +149,7 @@ class Tracker:
 
         def located(looks: Sequence[Look]) -> Estimate:
             found = self._locator.locate(looks, grid, seed, pieces, any_pose)
-            return self._judged(_told(found, shown, given), looks, False)
+            return self._judged(_with_pieces(found, shown, given), looks, False)
 
         with self._explaining_errors(looks, _DEFAULTS, bool(pieces)):
             estimate, looks = likeliest_piece(looks, located)
@@ -287,7 +287,9 @@ def _shifted(estimate: Estimate, by_mm: Float64[np.ndarray, " 3"]) -> Estimate:
     return made.reporting(parts=parts, evidence=evidence, motion=motion, fit_cost=cost)
 
 
-def _told(estimate: Estimate, shown: Sequence[Evidence], given: Sequence[Evidence]) -> Estimate:
+def _with_pieces(
+    estimate: Estimate, shown: Sequence[Evidence], given: Sequence[Evidence]
+) -> Estimate:
     """The estimate with what it says of evidence that was its cloud, in the order of all that was
     ``given``."""
     motion = estimate.motion

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -31,6 +32,7 @@ from tumortrack.core.organ import is_tumor
 from tumortrack.core.report import FAR_OFF
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.registration.model import RegistrationModel
+from tumortrack.report import drawing
 from tumortrack.report.rivals import best_rigid_pose, rigid_fit
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack.tracking.fingerprint import fingerprint
@@ -46,6 +48,8 @@ _VERTICES = 300  # of a part, where its miss is measured
 # Two readers' kidneys differ by 0.5 mm rms (KiTS23). Scenes whose true organ differs from the case
 # by more than this are of worse segmentations than the bounds are for.
 READERS_MM = 0.75
+_TICKS_MM = (2, 5, 10, 20, 50, 100)
+_IN_A_BIN, _MOST_BINS = 40, 6  # answers of which a quantile is shown
 _ANSWER = ["organ", "scene", "answer"]
 _ABOUT = {
     *_ANSWER, "shape", "family", "segmentation_mm", "by", "evidence", "part", "miss_mm",
@@ -275,23 +279,52 @@ def _weighted_quantile(values: np.ndarray, share: np.ndarray) -> float:
     return float(values[order][rank])
 
 
-def left_out(rows: pd.DataFrame, part: str, by: str | None = None) -> pd.DataFrame:
-    """What it says of each organ, family of physics or kind of evidence when it was learned from
-    the others: a line for each, or of ``by``. An answer is good if that holds for all its
-    tumors."""
+def bounded(rows: pd.DataFrame, part: str) -> pd.DataFrame:
+    """Tumors with the ``bound_mm`` that was learned without their organ, their family of physics or
+    their kind of evidence."""
     tumors = rows[rows.part.map(is_tumor)].assign(bound_mm=np.nan)
     for name in tumors[part].unique():
         mine = tumors[part] == name
         model = quantile_of(tumors[~mine])
         each = tumors[mine][[*model.hinges]].to_dict("records")
         tumors.loc[mine, "bound_mm"] = [model.bound_mm(known) for known in each]
+    return tumors
+
+
+def draw(tumors: pd.DataFrame, path: Path) -> None:
+    """Whether bounds hold: for bounds of each size, the 95 % quantile of the largest misses, by
+    family of physics and by kind of evidence."""
+    figure = drawing.new_figure(8.0, 4.4, left=0.08, right=0.98, top=0.88, bottom=0.14)
+    calm = tumors[_acceptable(tumors)]
+    for axes, by in zip(figure.subplots(1, 2, sharey=True), ("family", "evidence"), strict=True):
+        axes.plot(*[(1.5, 20)] * 2, color="0.6", linestyle="--")
+        for number, (name, some) in enumerate([("all", calm), *calm.groupby(by)]):
+            bins = max(min(len(some) // _IN_A_BIN, _MOST_BINS), 1)
+            size = some.groupby(pd.qcut(some.bound_mm, bins, duplicates="drop"), observed=True)
+            along = size.bound_mm.median(), size.miss_mm.quantile(CONFIDENCE)
+            style = {"color": "0.1" if name == "all" else f"C{number % 10}", "markersize": 4}
+            style["linewidth"] = 2.2 if name == "all" else 1.0
+            axes.plot(*along, marker="o", label=name, **style)
+        axes.set(xscale="log", yscale="log", xlabel=f"bound, mm, by {by}")
+        axes.set_xticks(_TICKS_MM[:4], _TICKS_MM[:4])
+        axes.set_yticks(_TICKS_MM, _TICKS_MM)
+        axes.minorticks_off()
+        axes.legend(fontsize=7, frameon=False)
+        axes.grid(color="0.9")
+    figure.axes[0].set_ylabel("95 % of the largest misses, mm")
+    drawing.save(figure, path)
+
+
+def left_out(tumors: pd.DataFrame, by: str) -> pd.DataFrame:
+    """A line for each of ``by``, of what ``bounded`` made: what was learned from the others says of
+    it. An answer is good if that holds for all its tumors."""
     near = _acceptable(tumors) & (tumors.bound_mm <= POOR_MM)
     good = near.groupby([tumors[name] for name in _ANSWER]).transform("all")
     lines = []
-    for name, some in [*tumors.groupby(by or part), ("all", tumors)]:
+    for name, some in [*tumors.groupby(by), ("all", tumors)]:
         calm, mine = some[_acceptable(some)], some[good[some.index]]
         lines.append({
-            by or part: name,
+            by: name,
             "answers": len(some),
             "good %": round(100 * len(mine) / len(some)),
             "center of good, mm: median": round(mine.center_mm.median(), 1),
