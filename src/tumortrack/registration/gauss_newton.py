@@ -98,7 +98,7 @@ class GaussNewton:
     in ``RegistrationResult``; infinite before the first step. ``steps``: taken so far;
     ``converged``: more would not move it. ``moved``: the start's, as in ``RegistrationResult``;
     None: the prior has the pose where it starts. ``precision``: of the prior of shift, turn and
-    coefficients; None: the library's. ``terms``: of the evidence at the start, if known."""
+    coefficients; None: the library's."""
 
     def __init__(
         self,
@@ -108,7 +108,6 @@ class GaussNewton:
         config: GaussNewtonConfig,
         moved: Float64[np.ndarray, " 6"] | None = None,
         precision: Float64[np.ndarray, "p p"] | None = None,
-        terms: Terms | None = None,
     ) -> None:
         body, count = rest.body, len(looks.points_mm)
         precision = prior_precision(rest, config) if precision is None else precision
@@ -134,7 +133,7 @@ class GaussNewton:
         already = np.zeros(6) if moved is None else np.array(moved, float)
         self._state = kernels.State(rotation, centre_mm, coefficients, already, *left)
         self.cost, self.steps, self.converged = np.inf, 0, False
-        self._terms = terms  # of the evidence, at the present state
+        self._terms: Terms | None = None  # of the evidence, at the present state
 
     def run(self, steps: int) -> None:
         """Continue until ``steps`` are taken since the start, or it has converged."""
@@ -145,18 +144,18 @@ class GaussNewton:
             self.steps, self.converged, self.cost = reached
             return
         if not np.isfinite(self.cost):
-            self._step(0, 0, self._terms)
+            self._step(0, 0)
         while self.steps < steps and not self.converged:
             self._step(self.steps + 1, self.steps + 2)  # from 1 on: only then no equations first
             self.steps += 1
 
-    def _step(self, first: int, last: int, terms: Terms | None = None) -> None:
-        """With the evidence in the equations that it leaves; ``terms``: as they are there."""
+    def _step(self, first: int, last: int) -> None:
+        """With the evidence in the equations that it leaves."""
         state, evidence = self._state, self._looks.evidence
         _, self.converged, cost = kernels.descend(self._problem, state, first, last)
         motion = ElasticMotion(self._rest, state.rotation, state.centre_mm, state.coefficients)
         assert evidence is not None
-        self._terms = terms or evidence.at(motion)
+        self._terms = evidence.at(motion)
         self.cost = cost + self._terms.add_to(state.curvature, state.gradient)
 
     def result(self) -> RegistrationResult:
