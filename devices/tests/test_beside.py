@@ -32,7 +32,7 @@ from tumortrack_devices.sinks.viewer import ViewerSinkConfig
 TURN = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
 ROBOT = PublishedFrame("robot", rigid(TURN, np.array([400.0, -250.0, 90.0])))
 POINTS_CT = np.array([[12.0, -8.0, 30.0], [-20.0, 4.0, 6.0], [3.0, 25.0, -11.0]])
-STD_MM = (1.34, 0.93, 0.81, 0.78)
+BOUND_MM = (1.34, 0.93, 0.81, 0.78)
 LABELS = ["1: 1.3 -> 0.9 mm", "2: 0.9 -> 0.8 mm", "3: 0.8 -> 0.8 mm"]
 MISS = Finding("miss", {"part": "tumor_1", "miss_mm": 4.0})
 RIVAL = Finding("rival", {"part": "tumor_1", "apart_mm": 12.0})
@@ -71,7 +71,8 @@ def told(
     advice = [
         {
             "kind": "touch", "part": "tumor_1", "place_mm": place.tolist(),
-            "direction": (0.0, 0.0, -1.0), "std_mm": STD_MM[n], "then_std_mm": STD_MM[n + 1],
+            "direction": (0.0, 0.0, -1.0), "std_mm": 1.0, "then_std_mm": 0.9,
+            "bound_mm": BOUND_MM[n], "then_bound_mm": BOUND_MM[n + 1],
         }
         for n, place in enumerate(motion.carry(points_ct))
     ]  # fmt: skip
