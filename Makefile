@@ -162,7 +162,7 @@ rehearsal: setup  ## the experiment on a bench that does not exist, by all its c
 	$(BIN)/python lab/scripts/rehearsal.py $(ARGS)
 
 pictures: demo debian  ## the pictures in docs/images that the demo shows (docs/pictures.md has the others; 10 minutes)
-	cp runs/demo/scenes/dragged-0002.png docs/images/demo.png
+	cp runs/demo/scenes/elastic-0007.png docs/images/demo.png
 	$(BIN)/tumortrack locate runs/demo/case runs/demo/dataset/elastic-0005/cloud.ply runs/pictures/run --depth-error 0 --overwrite
 	$(BIN)/tumortrack plan runs/pictures/run runs/pictures/plan --accept-budget --overwrite
 	cp runs/pictures/plan/plan.png docs/images/plan.png
