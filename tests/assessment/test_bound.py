@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 
 from reports import reporting
 from tumortrack.assessment import bound, verdict
+from tumortrack.assessment.advice import advise, worthwhile
 from tumortrack.assessment.bound import (
     POOR_MM,
     BoundModel,
@@ -134,6 +136,30 @@ def test_a_factor_multiplies_the_bound_and_so_decides(slim_model, one_place, mon
         assert bound_mm == pytest.approx(factor * 0.8 * POOR_MM)
         assert (None if said.finding is None else said.finding.kind) == kind
         assert bool(said.shown) == (kind is None)
+
+
+def test_what_is_foreseen_of_a_touch_follows_those_before_it(slim_model, one_place, monkeypatch):
+    by_std = Quantile(math.log(3.0), {"center_std": ((-20.0, 1.0),)})
+    model = BoundModel(fingerprint(), by_std, by_std, {"touch": 1.0}, {})
+    monkeypatch.setattr(bound, "shipped", lambda: model)
+    tracker = Tracker(replace(load_model(slim_model, "cpu"), bound_factor=1.25))
+    found = tracker.locate(replace(visible(), depth_error=DepthError(0.0)), 16, 0)
+    *touches, outline, _ = every = advise(found, "tumor_1")
+    assert [each.kind for each in every] == ["touch", "touch", "touch", "outline", "look"]
+    now_mm = found.assessment.bounds["tumor_1"].error_bound95_mm
+    assert touches[0].bound_mm == outline.bound_mm == pytest.approx(now_mm)
+    for before, after in itertools.pairwise(touches):
+        assert after.bound_mm == before.then_bound_mm < before.bound_mm
+    for each in every:  # here the bound is as large as the standard deviation
+        assert each.then_bound_mm / now_mm == pytest.approx(each.then_std_mm / outline.std_mm)
+
+
+def test_advice_without_a_bound_claims_none(estimate):
+    surfaces = replace(estimate_of(estimate.meshes), motion=estimate.motion)
+    every = advise(surfaces, "tumor_1")
+    assert {(each.bound_mm, each.then_bound_mm) for each in every} == {(None, None)}
+    assert not any("95 %" in each.words for each in every)
+    assert worthwhile(every) == ()
 
 
 def test_an_organ_without_tumors_is_judged_by_its_own_bound(estimate):

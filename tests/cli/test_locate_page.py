@@ -222,7 +222,10 @@ def test_structures_are_drawn_and_named(tmp_path):
 def test_the_page_shows_evidence_and_what_to_learn_next_where_the_organ_surely_lies(
     tmp_path, placed
 ):
-    place_mm, then_mm = [4.0, -3.0, 104.0], {"touch": 3.12, "look": 4.01}
+    place_mm = [4.0, -3.0, 104.0]
+    foreseen = [  # each touch after those before it
+        ("touch", 5.26, 3.12), ("touch", 3.12, 2.5), ("touch", 2.5, 2.2), ("look", 5.26, 4.01)
+    ]  # fmt: skip
     known = [
         {"name": "touch", "tool": "probe", "off_mm": 0.44, "news": 0.312, "left_out": False},
         {"name": "outline", "off_mm": 24.0, "news": 0.0, "left_out": True},
@@ -232,9 +235,9 @@ def test_the_page_shows_evidence_and_what_to_learn_next_where_the_organ_surely_l
         {
             "kind": kind, "part": "tumor_1", "place_mm": place_mm,
             "direction": [0.0, 0.0, -1.0], "std_mm": 1.33, "then_std_mm": 0.9,
-            "bound_mm": 5.26, "then_bound_mm": then_mm[kind],
+            "bound_mm": bound_mm, "then_bound_mm": then_mm,
         }
-        for kind in ("touch", "touch", "touch", "look")
+        for kind, bound_mm, then_mm in foreseen
     ]  # fmt: skip
     estimate = advised(reporting(small_estimate(), evidence=known), advice)
     rival = Finding("rival", {"part": "tumor_1", "apart_mm": 9.0})

@@ -17,7 +17,7 @@ from tumortrack.core.types import DepthFrame, Look, SensorCloud
 
 NOWHERE = {
     "camera_from_ct": [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]],
-    **{"coefficients": [], "rarity": 0.3, "steps": 4, "compliance_std_mm": None},
+    **{"coefficients": [], "rarity": 0.3, "steps": 4, "compliance_std_mm": None, "misfit_mm": 0.1},
 }
 
 

@@ -213,8 +213,7 @@ class Operation:
             return reaches(there_mm, table_from_camera[:3, :3] @ normal)
 
         advice = advise(estimate, self.planned.plan.tumor, reach)
-        worth = worthwhile(estimate.report, advice, estimate.assessment.factor)
-        return estimate.assessed(next_evidence=worth)
+        return estimate.assessed(next_evidence=worthwhile(advice))
 
     def evidence(self, camera_from_published: Affine, stamp_ns: int) -> tuple[Evidence, ...]:
         """Where the holder has the tissue that it grips, in a frame of the camera."""

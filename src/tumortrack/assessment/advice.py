@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
-from tumortrack.assessment.bound import bounds_of, foreseen_mm, shipped
+from tumortrack.assessment.bound import bound_mm, shipped
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import Points, transform_points, triangles_of
@@ -45,16 +45,16 @@ def advise(estimate: Estimate, part: str, reach: Reach | None = None) -> tuple[N
     return with_bounds(estimate.report, advice, estimate.assessment.factor)
 
 
-def worthwhile(
-    report: FitReport, advice: Sequence[NextEvidence], factor: float
-) -> tuple[NextEvidence, ...]:
+def worthwhile(advice: Sequence[NextEvidence]) -> tuple[NextEvidence, ...]:
     """The advice that pays: what lowers a bound by over a third of a millimetre, of kinds whose
-    foreseen gains were found in scenes left out. ``factor``: of the bounds."""
+    foreseen gains were found in scenes left out."""
     kinds = shipped().advice
     return tuple(
         each
-        for each in with_bounds(report, advice, factor)
+        for each in advice
         if _FOUND[0] <= kinds.get(each.kind, 0.0) <= _FOUND[1]
+        and each.bound_mm is not None
+        and each.then_bound_mm is not None
         and each.bound_mm - each.then_bound_mm > _LEAST_GAIN_MM
     )
 
@@ -62,15 +62,22 @@ def worthwhile(
 def with_bounds(
     report: FitReport, advice: Sequence[NextEvidence], factor: float
 ) -> tuple[NextEvidence, ...]:
-    """The advice with the bound that it would lower, as far as that is known."""
-    now, told = bounds_of(report), list[NextEvidence]()
-    for each in advice:
-        if (then_mm := foreseen_mm(report, each)) is None:
-            told.append(each)
-            continue
-        bounds = {"bound_mm": factor * now[each.part].error_bound95_mm}
-        told.append(msgspec.structs.replace(each, **bounds, then_bound_mm=factor * then_mm))
-    return tuple(told)
+    """The advice on a part with the bound that each piece would lower, after those before it, as
+    far as that is known. ``factor``: of the bounds."""
+    now_mm = max((each.std_mm for each in advice), default=0.0)
+
+    def most_mm(part: str, std_mm: float) -> float | None:
+        most_mm = bound_mm(report, part, std_mm / now_mm)
+        return most_mm and factor * most_mm
+
+    return tuple(
+        msgspec.structs.replace(
+            each,
+            bound_mm=most_mm(each.part, each.std_mm),
+            then_bound_mm=most_mm(each.part, each.then_std_mm),
+        )
+        for each in advice
+    )
 
 
 def where_to_look(estimate: Estimate, looks: Sequence[Look], hides: bool = True) -> str:

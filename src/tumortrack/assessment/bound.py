@@ -17,7 +17,7 @@ from typing import Any
 
 from tumortrack.core.assessment import ErrorBound
 from tumortrack.core.config import Config, from_builtins
-from tumortrack.core.report import FitReport, NextEvidence
+from tumortrack.core.report import FitReport
 
 _NAME = "bounds.json"
 # An answer is poor from this bound on. docs/trust.md has what that is worth for organs, families
@@ -96,18 +96,22 @@ def depths_within_mm(report: FitReport, name: str) -> float:
     return _WITHIN * report.motion.depth_share * math.hypot(*center_mm)
 
 
-def foreseen_mm(report: FitReport, advice: NextEvidence) -> float | None:
-    """The bound of the part that a piece of evidence is for, once that is known, without a factor;
-    None: not known. What it does not narrow stays."""
-    known = figures(report, advice.part)
-    if known is None:
+def bound_mm(report: FitReport, name: str, share: float = 1.0) -> float | None:
+    """How far off a part is at most (95 %), without a factor: what was learned, and what the
+    camera's depths err by beside that; at least how far off it is in fits that are as likely.
+
+    Args:
+        share: by which its standard deviations are multiplied; the other figures stay.
+    """
+    if (known := figures(report, name)) is None:
         return None
-    less = math.log(advice.then_std_mm / advice.std_mm)
-    then = {name: known[name] + less for name in ("center_std", "surface_std")}
-    quantile = shipped().tumor if advice.part in report.tumors else shipped().organ
-    bound_mm = quantile.bound_mm({**known, **then})
-    bound_mm = math.hypot(bound_mm, depths_within_mm(report, advice.part))
-    return max(bound_mm, alternatives_mm(report, advice.part))
+    for std in ("center_std", "surface_std"):
+        known[std] += math.log(share)
+    quantile = shipped().tumor if name in report.tumors else shipped().organ
+    learned_mm = quantile.bound_mm(known)
+    return max(
+        math.hypot(learned_mm, depths_within_mm(report, name)), alternatives_mm(report, name)
+    )
 
 
 def alternatives_mm(report: FitReport, name: str) -> float:
@@ -121,14 +125,10 @@ def alternatives_mm(report: FitReport, name: str) -> float:
     return 0.0
 
 
-def bounds_of(report: FitReport) -> dict[str, ErrorBound]:
-    """Of each part, where the method knows enough: what was learned, and what the camera's depths
-    err by beside that; at least how far off it is in fits that are as likely."""
+def bounds_of(report: FitReport, factor: float = 1.0) -> dict[str, ErrorBound]:
+    """Of each part, where the method knows enough, times a factor."""
     bounds = {}
     for name, part in report.parts.items():
-        quantile = shipped().tumor if name in report.tumors else shipped().organ
-        if (known := figures(report, name)) is not None:
-            bound_mm = math.hypot(quantile.bound_mm(known), depths_within_mm(report, name))
-            bound_mm = max(bound_mm, alternatives_mm(report, name))
-            bounds[name] = ErrorBound(bound_mm, part.center_axes and part.center_axes[0])
+        if (most_mm := bound_mm(report, name)) is not None:
+            bounds[name] = ErrorBound(factor * most_mm, part.center_axes and part.center_axes[0])
     return bounds

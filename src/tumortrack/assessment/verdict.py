@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 from jaxtyping import Bool
 
-from tumortrack.assessment.advice import worthwhile
+from tumortrack.assessment.advice import with_bounds, worthwhile
 from tumortrack.assessment.bound import POOR_MM, bounds_of, depths_within_mm
-from tumortrack.core.assessment import ErrorBound
+from tumortrack.core.assessment import ErrorBound, deciding
 from tumortrack.core.errors import NotThisOrgan
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
@@ -93,7 +93,7 @@ def judged(
     report = msgspec.structs.replace(
         estimate.report, unseen=unseen if clouds else estimate.report.unseen
     )
-    bounds = {name: bound.times(factor) for name, bound in bounds_of(report).items()}
+    bounds = bounds_of(report, factor)
     finding = _misplaced_camera(report.looks)
     finding = finding or _misfit(report, rim_share > _RIM_SHARE and not strictly)
     finding = finding or _doubt(report, bounds)
@@ -102,9 +102,9 @@ def judged(
         finding = Finding("seen_through", {"percent": 100 * through})
     elif unseen > _MAX_UNSEEN and finding is None and not _deciding(report, bounds):
         finding = Finding("unseen", {"percent": 100 * unseen})
-    advice = worthwhile(report, estimate.assessment.next_evidence, factor)
-    told = {"bounds": bounds, "factor": factor, "finding": finding, "next_evidence": advice}
-    return estimate.assessed(**told).reporting(
+    advice = worthwhile(with_bounds(report, estimate.assessment.next_evidence, factor))
+    judged = estimate.assessed(bounds=bounds, factor=factor, finding=finding, next_evidence=advice)
+    return judged.reporting(
         unseen=report.unseen,
         seen_through=through,
         in_sight=in_sight,
@@ -224,8 +224,8 @@ def _telling(value: float, limit: float) -> str:
 def _deciding(report: FitReport, bounds: Mapping[str, ErrorBound]) -> Mapping[str, ErrorBound]:
     """The bounds by which an answer is judged: all tumors', or of an organ without tumors its own;
     empty if one is not known."""
-    names = [*report.tumors] or [*report.parts]
-    return {name: bounds[name] for name in names} if bounds.keys() >= set(names) else {}
+    known = deciding(bounds)
+    return known if known.keys() >= {*(report.tumors or report.parts)} else {}
 
 
 def _unsure(report: FitReport) -> Finding | None:

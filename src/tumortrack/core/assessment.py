@@ -23,9 +23,6 @@ class ErrorBound(msgspec.Struct, frozen=True):
     error_bound95_mm: float
     least_sure: Point | None = None
 
-    def times(self, factor: float) -> ErrorBound:
-        return msgspec.structs.replace(self, error_bound95_mm=factor * self.error_bound95_mm)
-
     @property
     def words(self) -> str:
         return f"off by at most {self.error_bound95_mm:.1f} mm (95 %)"

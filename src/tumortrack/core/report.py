@@ -218,8 +218,8 @@ class NextEvidence(_Value, frozen=True, kw_only=True):
     direction: Point
     std_mm: float
     then_std_mm: float
-    bound_mm: float = 0.0
-    then_bound_mm: float = 0.0
+    bound_mm: float | None = None  # not known
+    then_bound_mm: float | None = None
     name: str = ""
 
     @property
@@ -232,6 +232,8 @@ class NextEvidence(_Value, frozen=True, kw_only=True):
             "landmark": f"point at {self.name}",
             "look": f"look from {x}, {y}, {z} mm as well",
         }[self.kind]
+        if self.bound_mm is None or self.then_bound_mm is None:
+            return what
         bounds = f"{self.then_bound_mm:.1f} mm instead of {self.bound_mm:.1f}"
         return f"{what}: {self.part} would be off by at most {bounds} (95 %)"
 
@@ -255,7 +257,7 @@ class MotionReport(_Value, frozen=True, kw_only=True):
     rarity: float
     steps: int
     compliance_std_mm: float | None
-    misfit_mm: float = 0.1
+    misfit_mm: float
     depth_share: float = 0.0  # not stated by runs of before
 
 

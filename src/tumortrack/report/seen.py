@@ -65,9 +65,10 @@ def next_evidence(estimate: Estimate | None) -> tuple[NextEvidence, ...]:
 
 
 def next_lines(estimate: Estimate | None) -> list[str]:
-    """The same in words: the best alone."""
-    every = next_evidence(estimate)
-    best = min(every, key=lambda each: each.then_bound_mm, default=None)
+    """The same in words: the best of what can be done at once, each kind's first alone; what
+    follows it presumes it."""
+    first = {each.kind: each for each in reversed(next_evidence(estimate))}.values()
+    best = min(first, key=lambda each: each.then_bound_mm or np.inf, default=None)
     return [] if best is None else [f"next, {best.words}"]
 
 

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
-from msgspec.structs import replace as replace_struct
 from scipy.interpolate import RBFInterpolator
 from scipy.optimize import minimize
 from scipy.stats import spearmanr
@@ -23,7 +22,6 @@ from tumortrack.assessment.bound import (
     BoundModel,
     Quantile,
     figures,
-    foreseen_mm,
 )
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import FAR_MM, Estimate
@@ -152,8 +150,7 @@ def advice_rows(tracker: Tracker, scene: Scene, seed: int) -> Iterator[dict[str,
             number = int(part.removeprefix("tumor_")) - 1
             outline = source.outline(number, np.array(mine[0].direction))
             pieces = [] if outline is None else [outline]
-        foreseen = replace_struct(mine[-1], std_mm=mine[0].std_mm)
-        then_mm = foreseen_mm(before.report, foreseen)
+        then_mm = mine[-1].then_bound_mm
         try:
             after = tracker.locate(scene.cloud, 8, 0, None, [each.evidence for each in pieces])
         except NoEstimate:
