@@ -15,7 +15,7 @@ from tumortrack.registration.bend import (
     _grouped,
     _Groups,
     _Linear,
-    _means_of_groups,
+    _Means,
     _precision_of_forces,
     _with_compliance,
     bend,
@@ -81,7 +81,13 @@ def test_how_far_the_prior_holds_a_part_is_how_far_it_moves_without_some_of_it()
     fit = refine(START.shape, looks, START, near)
     middles_ct, precision = fit.motion.shape.middles_ct, prior_precision(START.shape, CONFIG)
     less = 0.05
-    freer = GaussNewton(START.shape, looks, fit.motion, near, fit.moved, (1 - less) * precision)
+    more, body, mean = (1 - less) ** -0.5, START.shape.body, START.shape.body.mean
+    states = (mean + more * (body.states - mean)).astype(np.float32)
+    wider = replace(START.shape, body=replace(body, states=states))
+    wide = {name: more * getattr(near, name) for name in ("shift_mm", "turn_rad")}
+    wide = msgspec.structs.replace(near, **wide)
+    np.testing.assert_allclose(prior_precision(wider, wide), (1 - less) * precision, rtol=0.02)
+    freer = GaussNewton(wider, looks, fit.motion, wide, fit.moved)
     freer.run(40)
     away_mm = freer.result().motion.carry(middles_ct) - fit.motion.carry(middles_ct)
     slope = precision @ np.append(fit.moved, fit.motion.coefficients - START.shape.body.mean)
@@ -109,8 +115,9 @@ def test_an_organ_near_the_mean_has_a_narrow_prior_and_one_far_off_a_wide_one():
     for share in (0.0, 1.0, 2.5):
         fit = refined(seen(placed(share=share)), START, CONFIG)
         start = _with_compliance(fit.motion)
-        at = fit.looks.residuals(start, CONFIG)
-        spreads.append(_Groups.near(fit, start, at, CONFIG, None, 0.4).likeliest()[1])
+        near, points_ct = fit.looks.residuals(start, CONFIG), start.back(fit.looks.points_mm)
+        groups = _Groups.near(fit, _Means.of(near, points_ct), CONFIG, None, 0.4)
+        spreads.append(groups.likeliest()[1])
     assert spreads[0] < 0.9
     assert spreads == sorted(spreads)
     assert spreads[2] > 1.2
@@ -129,20 +136,20 @@ def test_the_evidence_is_that_of_all_unknowns(std_mm, monkeypatch):
     monkeypatch.setattr(module, "_LINEAR_STEPS", 40)  # until the weights stay
     fit = refined(seen(pressed(0)), START, CONFIG)
     start, scale = _with_compliance(fit.motion), 0.7
-    near, points_ct = fit.looks.residuals(start, CONFIG), start.back(fit.looks.points_mm)
-    rows = np.column_stack([near.by_motion, near.distances_mm]).astype(np.float32)
-    rows, counts, middles_ct = _means_of_groups(rows, points_ct)
+    near = fit.looks.residuals(start, CONFIG)
+    means = _Means.of(near, start.back(fit.looks.points_mm))
+    rows = means.rows
     motion, field = rows[:, :-1], np.eye(len(rows))  # what neighbours share: an unknown a group
     slopes, distances_mm = np.concatenate([motion, field], axis=1), rows[:, -1]
     precision = np.zeros((slopes.shape[1],) * 2)
     known, count = POSE + len(fit.motion.coefficients), motion.shape[1]
     precision[:known, :known] = prior_precision(fit.motion.shape, CONFIG)
     precision[known:count, known:count] = np.eye(count - known) / std_mm**2
-    shared = scale**2 * covariance_mm2(middles_ct) + 1e-9 * field
+    shared = scale**2 * covariance_mm2(means.middles_ct) + 1e-9 * field
     precision[count:, count:] = np.linalg.inv(shared)
     off = np.zeros(len(precision))
     off[:known] = np.append(fit.moved, fit.motion.coefficients - fit.motion.shape.body.mean)
-    weight = fit.looks.weight(CONFIG) * counts
+    weight = fit.looks.weight(CONFIG) * means.counts
     change = np.zeros(len(precision))
     for _ in range(40):  # Gauss-Newton steps of all unknowns
         residuals_mm = distances_mm + slopes @ change
@@ -154,7 +161,7 @@ def test_the_evidence_is_that_of_all_unknowns(std_mm, monkeypatch):
     expected = weight @ (squares / (1 + squares / 4))
     expected += (off + change) @ precision @ (off + change)
     expected += np.linalg.slogdet(curvature)[1] - np.linalg.slogdet(precision)[1]
-    cost = _Groups.near(fit, start, near, CONFIG, None, scale).cost(std_mm)
+    cost = _Groups.near(fit, means, CONFIG, None, scale).cost(std_mm)
     assert cost == pytest.approx(expected, rel=1e-3)
 
 

@@ -209,8 +209,8 @@ def _table(path: Path, with_camera: bool) -> tuple[str, tuple[Evidence, ...]]:
         several = given["kind"] in _OF_PLACES
         given |= {"places_mm": places} if several else {"place_mm": places[0]}
         whole = {"frame": given.pop("frame"), "unit": "mm", "evidence": [given]}
-        piece_known = _checked(whole, where, with_camera)
-        found, frames = [*found, *piece_known.evidence], frames | {piece_known.frame}
+        one = _checked(whole, where, with_camera)
+        found, frames = [*found, *one.evidence], frames | {one.frame}
     if len(frames) > 1:
         raise InputError(f"{path} has places in frames {', '.join(sorted(frames))}; give one.")
     return frames.pop(), tuple(found)

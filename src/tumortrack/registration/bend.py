@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int64
+from jaxtyping import Float, Float64, Int64
 from scipy.linalg import cho_factor, cho_solve
 
 from tumortrack.core.mesh_kernels import farthest
@@ -68,12 +68,13 @@ def bend(fit: RegistrationResult, config: GaussNewtonConfig) -> BentFit:
     """A fit of the library, continued in the compliance that its points ask for; with its rivals,
     which stay as they are."""
     start, looks = _with_compliance(fit.motion), fit.looks
-    misfit_mm = _misfit_mm(fit)
-    scale = min(max(misfit_mm / _USUAL_MISFIT_MM, _SCALES[0]), _SCALES[1])
+    near, usual = looks.residuals(start, config), looks.weight(config)
+    means = _Means.of(near, start.back(looks.points_mm))
+    scale = min(max(means.misfit_mm / _USUAL_MISFIT_MM, _SCALES[0]), _SCALES[1])
     config = msgspec.structs.replace(config, sigma_mm=scale * config.sigma_mm)
-    near = looks.residuals(start, config)
+    near = replace(near, weights=near.weights * (looks.weight(config) / usual))
     terms = None if looks.evidence is None else looks.evidence.at(start)
-    std_mm, spread = _Groups.near(fit, start, near, config, terms, scale).likeliest()
+    std_mm, spread = _Groups.near(fit, means, config, terms, scale).likeliest()
     of_library = prior_precision(fit.motion.shape, config)
     of_library[POSE:, POSE:] /= spread**2
     precision = _blocks(of_library, _precision_of_forces(near, len(of_library), std_mm))
@@ -91,7 +92,7 @@ def bend(fit: RegistrationResult, config: GaussNewtonConfig) -> BentFit:
         distances_mm=at.distances_mm,
         steps=fit.steps + steps,
         compliance_std_mm=std_mm,
-        misfit_mm=misfit_mm,
+        misfit_mm=means.misfit_mm,
         prior_slope=precision @ np.append(at.moved, motion.coefficients - start.shape.body.mean),
         terms=at.terms,
     )
@@ -113,15 +114,6 @@ def _precision_of_forces(near: Residuals, known: int, std_mm: float) -> Float64[
     told = np.maximum(told, 0.0) * _TOLD_MM**2
     variances = (told * std_mm**2 + max(std_mm, _UNSEEN_MM) ** 2) / (told + 1)
     return (axes / variances) @ axes.T
-
-
-def _misfit_mm(fit: RegistrationResult) -> float:
-    """What a fit leaves of groups of points, root mean square, without what is none of it."""
-    rows = np.column_stack([fit.distances_mm]).astype(np.float32)
-    means, counts, _ = _means_of_groups(rows, fit.motion.back(fit.looks.points_mm))
-    off_mm = np.abs(means[:, 0])
-    near = off_mm < _FAR_OFF * np.median(off_mm) + _FAR_MM
-    return float(np.sqrt(np.average(off_mm[near] ** 2, weights=counts[near])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,30 +144,26 @@ class _Linear:
         error."""
         by_all = np.concatenate([near.by_motion, near.by_cameras], axis=1)
         count, cameras = len(precision), by_all.shape[1] - len(precision)
-        rows = np.column_stack([by_all, near.distances_mm])
-        weights, places_mm = near.weights, looks.points_mm
-        whole = rows.T @ (rows * weights[:, None])
+        rows, weights = np.column_stack([by_all, near.distances_mm]), near.weights
+        on, places_mm = np.arange(len(rows)), looks.points_mm  # the organ: rows, and where
         by_shifts, error = np.zeros((len(rows), 0)), motion.shape.model_error
         if terms is not None and looks.evidence is not None:
+            on = np.append(on, len(rows) + looks.evidence.on_organ)
+            places_mm = np.concatenate(
+                [places_mm, looks.evidence.places_mm[looks.evidence.on_organ]]
+            )
+            by_shifts = np.pad(terms.by_shifts, ((len(rows), 0), (0, 0)))
             more = np.pad(terms.by_motion, ((0, 0), (0, cameras)))
-            more = np.column_stack([more, terms.residuals_mm])
-            whole += more.T @ (more * terms.weights[:, None])
-            on = looks.evidence.on_organ
-            rows, weights = np.concatenate([rows, more[on]]), np.append(weights, terms.weights[on])
-            places_mm = np.concatenate([places_mm, looks.evidence.places_mm[on]])
-            by_shifts = np.concatenate([np.zeros((len(near.weights), terms.by_shifts.shape[1])),
-                                        terms.by_shifts[on]])  # fmt: skip
+            rows = np.concatenate([rows, np.column_stack([more, terms.residuals_mm])])
+            weights = np.append(weights, terms.weights)
         node = error.nearest(motion.back(places_mm))
         together = np.column_stack([rows, by_shifts])
-        own, across = error.equations(node, together, weights, scale)
-        if terms is not None:  # tools' shifts are marginalised with the field
-            shifts = terms.by_shifts.T * terms.weights
-            mixed = across[:, rows.shape[1] :]
-            own = np.block(
-                [[own, mixed], [mixed.T, np.eye(len(shifts)) + shifts @ terms.by_shifts]]
-            )
-            across = np.concatenate([across[:, : rows.shape[1]], shifts @ more])
-        whole -= across.T @ np.linalg.solve(own, across)
+        own, across = error.equations(node, together[on], weights[on], scale)
+        across, mixed = np.split(across, [rows.shape[1]], axis=1)
+        weighted = by_shifts.T * weights  # tools' shifts are marginalised with the field
+        own = np.block([[own, mixed], [mixed.T, np.eye(len(weighted)) + weighted @ by_shifts]])
+        across = np.concatenate([across, weighted @ rows])
+        whole = rows.T @ (rows * weights[:, None]) - across.T @ np.linalg.solve(own, across)
         errors = np.diag(np.tile(CAMERA_STD**-2, cameras // POSE))
         curvature, gradient = whole[:-1, :-1] + _blocks(precision, errors), whole[:-1, -1]
         change = np.append(moved, motion.coefficients - motion.shape.body.mean)
@@ -196,6 +184,39 @@ class _Linear:
         terms = None if evidence is None else evidence.at(motion).judged
         near, moved = looks.residuals(motion, config), self.moved + change[:POSE]
         return self.at(motion, moved, near, looks, precision, terms, scale)
+
+
+@dataclass(frozen=True, eq=False)
+class _Means:
+    """Of groups of neighbouring points, without what lies off the median distance: derivatives and,
+    last, distance; how many points each has, and their middle."""
+
+    rows: Float64[np.ndarray, "g q"]
+    counts: Int64[np.ndarray, " g"]
+    middles_ct: Float64[np.ndarray, "g 3"]
+
+    @classmethod
+    def of(cls, near: Residuals, points_ct: Float64[np.ndarray, "n 3"]) -> _Means:
+        """``near``: of the points, at a motion by which they are carried back."""
+        group, distances = _grouped(points_ct), near.distances_mm
+        order = np.lexsort([distances, group])
+        group, distances = group[order], distances[order]
+        counts = np.bincount(group)
+        first = np.cumsum(counts) - counts
+        median = distances[first + counts // 2]
+        weights = 1 / (1 + ((distances - median[group]) / _ALIKE_MM) ** 2) ** 2
+        weights /= np.add.reduceat(weights, first)[group]
+        rows = np.column_stack([near.by_motion, near.distances_mm]).astype(np.float32)[order]
+        means = np.add.reduceat(rows * weights.astype(np.float32)[:, None], first)
+        middles_ct = np.add.reduceat(points_ct[order], first) / counts[:, None]
+        return cls(means.astype(float), counts, middles_ct)
+
+    @property
+    def misfit_mm(self) -> float:
+        """What a fit leaves of the groups, root mean square, without what is none of it."""
+        off_mm = np.abs(self.rows[:, -1])
+        near = off_mm < _FAR_OFF * np.median(off_mm) + _FAR_MM
+        return float(np.sqrt(np.average(off_mm[near] ** 2, weights=self.counts[near])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,16 +244,13 @@ class _Groups:
     def near(
         cls,
         fit: RegistrationResult,
-        start: ElasticMotion,
-        at: Residuals,
+        of_groups: _Means,
         config: GaussNewtonConfig,
         terms: Terms | None,
         scale: float,
     ) -> _Groups:
-        """``start``: the fit's motion, with compliance; ``at``, ``terms``: there."""
-        body, points_ct = fit.motion.shape.body, start.back(fit.looks.points_mm)
-        rows = np.column_stack([at.by_motion, at.distances_mm]).astype(np.float32)
-        means, counts, middles_ct = _means_of_groups(rows, points_ct)
+        """``of_groups``, ``terms``: at the fit's motion, with compliance."""
+        body, counts, means = fit.motion.shape.body, of_groups.counts, of_groups.rows
         weights = fit.looks.weight(config) * counts
         width_mm = np.full(len(counts), fit.looks.width_mm(config))
         if terms is not None:
@@ -240,7 +258,7 @@ class _Groups:
             weights = np.append(weights, terms.std_mm**-2.0)
             width_mm = np.append(width_mm, terms.width_mm)
         shared = np.zeros((len(means), len(means)))
-        shared[: len(counts), : len(counts)] = scale**2 * covariance_mm2(middles_ct)
+        shared[: len(counts), : len(counts)] = scale**2 * covariance_mm2(of_groups.middles_ct)
         if terms is not None:
             shared[len(counts) :, len(counts) :] = terms.by_shifts @ terms.by_shifts.T
         by_library, by_compliance, distances_mm = np.split(means, [POSE + len(body.mean), -1], 1)
@@ -293,24 +311,6 @@ class _Groups:
 def _blocks(a: Float64[np.ndarray, "p p"], b: Float64[np.ndarray, "c c"]) -> np.ndarray:
     none = np.zeros((len(a), len(b)))
     return np.block([[a, none], [none.T, b]])
-
-
-def _means_of_groups(
-    rows: Float32[np.ndarray, "n q"], points_ct: Float64[np.ndarray, "n 3"]
-) -> tuple[Float64[np.ndarray, "g q"], Int64[np.ndarray, " g"], Float64[np.ndarray, "g 3"]]:
-    """Each group's mean row, without what lies off the median distance (the last column), how many
-    points it has, and their middle."""
-    group, distances = _grouped(points_ct), rows[:, -1]
-    order = np.lexsort([distances, group])
-    group, distances = group[order], distances[order]
-    counts = np.bincount(group)
-    first = np.cumsum(counts) - counts
-    median = distances[first + counts // 2]
-    weights = 1 / (1 + ((distances - median[group]) / _ALIKE_MM) ** 2) ** 2
-    weights /= np.add.reduceat(weights, first)[group]
-    means = np.add.reduceat(rows[order] * weights.astype(np.float32)[:, None], first)
-    middles_ct = np.add.reduceat(points_ct[order], first) / counts[:, None]
-    return means.astype(float), counts, middles_ct
 
 
 def _grouped(points_ct: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:

@@ -97,8 +97,7 @@ class GaussNewton:
     """A refinement that can be stopped on its way and continued. ``cost``: of the present state, as
     in ``RegistrationResult``; infinite before the first step. ``steps``: taken so far;
     ``converged``: more would not move it. ``moved``: the start's, as in ``RegistrationResult``;
-    None: the prior has the pose where it starts. ``precision``: of the prior of shift, turn and
-    coefficients; None: the library's."""
+    None: the prior has the pose where it starts."""
 
     def __init__(
         self,
@@ -107,10 +106,9 @@ class GaussNewton:
         start: ElasticMotion,
         config: GaussNewtonConfig,
         moved: Float64[np.ndarray, " 6"] | None = None,
-        precision: Float64[np.ndarray, "p p"] | None = None,
     ) -> None:
         body, count = rest.body, len(looks.points_mm)
-        precision = prior_precision(rest, config) if precision is None else precision
+        precision = prior_precision(rest, config)
         self._rest, self._looks, last_mm = rest, looks, looks.width_mm(config)
         # Copies in C's order, and floats, whatever was given: the kernel is compiled for that, and
         # would be once more for points that can't be written, or a whole number.

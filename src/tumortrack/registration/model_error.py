@@ -17,7 +17,7 @@ from tumortrack.core.geometry import triangles_of
 from tumortrack.core.mesh_kernels import farthest
 from tumortrack.core.types import Mesh
 
-# Two readers' kidneys differ by 0.5 mm rms, correlated over centimetres (KiTS23; docs/method.md).
+# Two readers' kidneys differ by 0.5 mm rms, correlated over centimetres (KiTS23).
 STD_MM, LENGTH_MM = 0.5, 20.0
 _APART = 0.85  # lengths between neighbouring nodes, at most
 _MOST_NODES = 256  # of a large organ: they then lie farther apart
