@@ -3,6 +3,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 TRACKER := .venv/.tracker
 SETUP := .venv/.installed
+NATIVE := src/tumortrack/native
+KERNELS := $(NATIVE)/kernels.elf
 CLIENTS := .clients/.installed
 TOOLS := .tools/.installed
 PIP := pip install --quiet --disable-pip-version-check --no-compile --no-deps
@@ -17,26 +19,38 @@ define INSTALL
 	$(or $(2),.venv)/bin/$(PIP) --require-hashes -r $(1); }
 endef
 
+# ziglang (440 MB) is there for the build alone, and only where nothing else compiles C.
+COMPILER = $(BIN)/python tools/build_backend.py --compiler >/dev/null 2>&1 || { echo "no C compiler here: ziglang, from PyPI"; $(call INSTALL,requirements/compiler.txt); }
+NO_COMPILER = $(BIN)/pip uninstall --quiet --yes ziglang 2>/dev/null
+
 .DEFAULT_GOAL := help
-.PHONY: help setup debian clients kernels demo test test-all quick pythons pytest test-hard check attack fuzz crash replay fingerprint figures bench soak wheel lock licences audit results real world sequences plans pull pulls bounds evidence noise rehearsal population site pictures clean
+.PHONY: help setup debian clients demo test quick pythons pytest test-hard check attack fuzz crash replay fingerprint figures bench soak wheel lock licences audit results real world sequences plans pull pulls bounds evidence noise rehearsal population site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
 
 setup: $(SETUP)  ## install everything into .venv: tracker, devices, the paper's method with PyTorch, resection, laboratory, experiment, what tests and the site need
 
-$(TRACKER): pyproject.toml requirements/core.txt requirements/uv.txt
+$(TRACKER): pyproject.toml requirements/core.txt requirements/uv.txt requirements/compiler.txt
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 15) and "tumortrack needs Python 3.11 to 3.14, and this is " + sys.version.split()[0] + "; give make PYTHON=python3.12, or another of these")'
 	@$(PYTHON) -c 'import ensurepip, venv' || { echo "$(PYTHON) cannot make environments; on Debian and Ubuntu: apt-get install python3-venv" >&2; exit 1; }
 	$(PYTHON) -m venv --clear .venv
 	@$(BIN)/$(PIP) --require-hashes -r requirements/uv.txt
 	@$(call INSTALL,requirements/core.txt)
+	@$(COMPILER)
 	$(BIN)/$(PIP) --no-build-isolation -e .
+	@$(NO_COMPILER)
+	@$(BIN)/python -m compileall -q -j 0 -x '/tests?/' .venv/lib src  # where nothing may be written every start would
 	$(BIN)/python -I -m pip check  # -I: what PYTHONPATH names, as ROS sets it, is none of ours
 	@touch $@
 
+$(KERNELS): $(wildcard $(NATIVE)/*.h $(NATIVE)/*/*.[ch]) tools/build_backend.py | $(TRACKER)
+	@$(COMPILER)
+	$(BIN)/python tools/build_backend.py
+	@$(NO_COMPILER)
+
 # PyTorch's CPU build is taken where pip knows of it, else PyPI's, which on x86-64 needs CUDA's packages.
-$(SETUP): $(TRACKER) devices/pyproject.toml occupancy/pyproject.toml resection/pyproject.toml lab/pyproject.toml experiment/pyproject.toml requirements/rest.txt requirements/cuda.txt requirements/torch-cpu.txt
+$(SETUP): $(TRACKER) $(KERNELS) devices/pyproject.toml occupancy/pyproject.toml resection/pyproject.toml lab/pyproject.toml experiment/pyproject.toml requirements/rest.txt requirements/cuda.txt requirements/torch-cpu.txt
 	@$(BIN)/$(PIP) --require-hashes -r requirements/torch-cpu.txt 2>/dev/null || echo "PyTorch: PyPI's build"
 	@$(call INSTALL,requirements/rest.txt)
 	@if $(BIN)/python -c 'from importlib.metadata import requires; print(requires("torch"))' | grep -q nvidia; then \
@@ -50,7 +64,7 @@ $(TOOLS): requirements/tools.txt
 	.tools/bin/$(PIP) --require-hashes -r requirements/tools.txt
 	touch $@
 
-demo: $(TRACKER)  ## install the tracker (without PyTorch), then CT -> tumors located in unseen deformed scenes (ARGS="--scenes 2": two of them)
+demo: $(TRACKER) $(KERNELS)  ## install the tracker (without PyTorch), then CT -> tumors located in unseen deformed scenes (ARGS="--scenes 2": two of them)
 	$(BIN)/tumortrack demo $(ARGS)
 
 check: setup  ## lint, types, import order, licences, figures in the pages
@@ -76,16 +90,10 @@ $(CLIENTS): requirements/clients.txt requirements/ur.txt
 	@$(call INSTALL,requirements/ur.txt,.clients)
 	@touch $@
 
-kernels: setup  ## compile what the first estimates would wait for, once instead of in each test process
-	$(BIN)/tumortrack compile --device cpu
-
 site: setup  ## the documentation's site, strictly: build/site/index.html (`.venv/bin/mkdocs serve`: while you write)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-test: check site kernels  ## check, then the tracker's tests (those of Chromium and Fast DDS after `make debian`, of others' programs after `make clients`)
-	$(MAKE) pytest ARGS=tests
-
-test-all: check site kernels pytest  ## the same with those of devices, the paper's method, resection, laboratory and experiment, as CI does
+test: check site pytest  ## check, then the tests of all distributions (those of Chromium and Fast DDS after `make debian`, of others' programs after `make clients`)
 
 quick: setup  ## the quickest tests of the tracker (a minute)
 	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2 -m 'not slow' tests/core tests/sense/test_render.py
@@ -117,7 +125,7 @@ figures: setup  ## write the measured figures of the pages from docs/data; fails
 test-hard: setup  ## tests on narrow vector units beside two busy processes (ARGS=tests/...)
 	@$(BIN)/python -c 'while True: pass' & one=$$!; $(BIN)/python -c 'while True: pass' & two=$$!; \
 	trap "kill $$one $$two" EXIT; ONEDNN_MAX_CPU_ISA=AVX2 ATEN_CPU_CAPABILITY=avx2 \
-	NUMBA_CPU_NAME=haswell OMP_NUM_THREADS=1 $(BIN)/pytest $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/pytest $(ARGS)
 
 bench: setup  ## speed of every part; fills docs/performance.md and docs/data/speed*.csv (5 minutes; ARGS=--quick)
 	$(BIN)/tumortrack bench --document docs/performance.md $(ARGS)
@@ -172,8 +180,11 @@ pictures: demo debian  ## the pictures in docs/images that the demo shows (docs/
 
 wheel: setup $(TOOLS)  ## build the wheels of tracker, devices, the paper's method, resection, experiment and laboratory into dist/, with their dependencies (SBOM)
 	rm -rf dist build/lib devices/build occupancy/build resection/build lab/build experiment/build  # modules that are gone would be packed from there
-	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist . ./devices ./occupancy ./resection ./experiment ./lab
+	CC=".tools/bin/python -m ziglang cc" $(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist --config-settings portable=1 .
+	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist ./devices ./occupancy ./resection ./experiment ./lab
+	$(BIN)/python tools/build_backend.py  # for this machine again
 	.tools/bin/twine check --strict dist/*.whl
+	.tools/bin/auditwheel show dist/tumortrack-*.whl
 	$(BIN)/python tools/dependencies.py sbom dist/tumortrack-*.whl dist/tumortrack_devices-*.whl dist/tumortrack_occupancy-*.whl dist/tumortrack_resection-*.whl dist/tumortrack_experiment-*.whl dist/tumortrack_lab-*.whl
 
 lock: setup $(TOOLS)  ## pin the dependencies by hash (ARGS=--upgrade: newest; ARGS="--upgrade-package NAME")

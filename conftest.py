@@ -3,7 +3,6 @@ marked slow run as users run them: checked, each call costs as much again."""
 
 import fcntl
 import os
-import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,16 +24,13 @@ PACKAGES = (
     ROOT / "experiment" / "src" / "tumortrack_experiment",
 )
 
-# Left out: modules with numba kernels (numba compiles the plain function); core.types, whose
-# constructors convert and check shapes themselves, always; and packages' __init__.py, with whom
-# all below them would be hooked.
+# Left out: core.types, whose constructors convert and check shapes themselves, always; and the
+# __init__.py of packages, with whom all below them would be hooked.
 CHECKED = [
     ".".join(path.relative_to(package.parent).with_suffix("").parts)
     for package in PACKAGES
     for path in sorted(package.rglob("*.py"))
-    if path.name not in ("__init__.py", "__main__.py")
-    and path != PACKAGES[0] / "core" / "types.py"
-    and not re.search("import (numba|njit)|^@n?jit", path.read_text(encoding="utf-8"), re.M)
+    if path.name not in ("__init__.py", "__main__.py") and path != PACKAGES[0] / "core" / "types.py"
 ]
 jaxtyping.install_import_hook(CHECKED, "checking.check_annotations")
 

@@ -91,8 +91,11 @@ def lock(upgrade: list[str]) -> None:
 
     tools = LOCKS / "tools.txt"
     kept = tools.read_text("utf-8") if tools.exists() else ""
-    tools.write_text(text := _resolved("uv\npip-audit\ntwine\n", kept, upgrade), "utf-8")
+    tools.write_text(
+        text := _resolved("uv\npip-audit\ntwine\nziglang\nauditwheel\n", kept, upgrade), "utf-8"
+    )
     (LOCKS / "uv.txt").write_text(pinned(text)["uv"], "utf-8")  # what `make setup` installs with
+    (LOCKS / "compiler.txt").write_text(pinned(text)["ziglang"], "utf-8")  # where there is none
 
 
 # What is supported: each Python on each kind of Linux machine, from glibc 2.28 on.

@@ -1,9 +1,11 @@
-"""Points inside a surface: against solid angles, and shapes of known size."""
+"""Points inside a surface: against solid angles, and shapes of known size; farthest points."""
 
 import numpy as np
+import pytest
 import trimesh
 
 from render_objects import bumpy
+from tumortrack.core.mesh_kernels import farthest
 from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import Mesh
 
@@ -44,3 +46,19 @@ def test_what_stands_inside_a_hollow_is_outside():
     points = np.array([[0.0, 0, 0], [0, 7, 0], [0, 0, 12], [-7, 1, 1]])
     inside = contains(Mesh(both.vertices, both.faces), points)
     np.testing.assert_array_equal(inside, [False, True, False, True])
+
+
+@pytest.mark.parametrize("n", [1, 5, 16, 77])
+def test_farthest_points_are_those_of_a_plain_search(n):
+    points = np.random.default_rng(n).normal(size=(2, 3, n)).astype(np.float32)
+    chosen = np.empty((2, min(n, 9)), np.int64)
+    farthest(points, np.array([0, n - 1]), chosen)
+    for cloud, found in zip(points, chosen, strict=True):
+        away = np.full(n, np.inf)
+        for step, newest in enumerate(found[:-1], start=1):
+            away = np.minimum(away, ((cloud - cloud[:, [newest]]) ** 2).sum(0))
+            assert away[found[step]] == pytest.approx(away.max(), rel=1e-6)
+    assert chosen[:, 0].tolist() == [0, n - 1]
+    for first in (-1, n):
+        with pytest.raises(ValueError, match="first choices"):
+            farthest(points, np.array([0, first]), chosen)

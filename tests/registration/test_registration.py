@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
-import subprocess
-import sys
 from itertools import pairwise
 
 import msgspec
@@ -355,35 +352,3 @@ def test_a_slow_general_optimiser_finds_the_same():
     assert fit.cost == pytest.approx(2 * found.cost, rel=0.02)
     apart = fit.motion.carry(inside(200)) - slow.carry(inside(200))
     assert np.linalg.norm(apart, axis=1).mean() < 0.5
-
-
-_FITTED = """
-import sys
-import numpy as np
-from tumortrack.registration.motion import ElasticMotion
-from tumortrack.registration.config import GaussNewtonConfig
-from tumortrack.registration.gauss_newton import refine
-from tumortrack.registration.looks import Looks
-from tumortrack.registration.rest_shape import RestShape
-given = dict(np.load(sys.argv[1]))
-points, rotation, centre = (given.pop(name) for name in ("points", "rotation", "centre"))
-shape = RestShape.from_arrays(given, 2)
-start = ElasticMotion(shape, rotation, centre, shape.body.mean)
-fit = refine(shape, Looks.of([points]), start, GaussNewtonConfig(steps=3))
-print(fit.motion.coefficients.tobytes().hex())
-"""
-
-
-@pytest.mark.slow
-def test_the_first_answer_of_a_machine_is_that_of_all_others(tmp_path):
-    """Kernels compiled by this process and kernels found in numba's cache add up alike."""
-    points, pose = surface(placed(), 300), {"rotation": START.rotation, "centre": START.centre_mm}
-    np.savez(tmp_path / "shape.npz", points=points, **pose, **shape().to_arrays())
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    words = [sys.executable, "-c", _FITTED, str(tmp_path / "shape.npz")]
-    compiled, found = (
-        subprocess.run(words, env=environment, capture_output=True, check=True, timeout=600).stdout
-        for _ in range(2)
-    )
-    assert len(compiled) > 300
-    assert compiled == found

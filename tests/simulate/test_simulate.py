@@ -230,7 +230,6 @@ def test_deformations_record_what_they_did_and_no_drag_does_nothing():
 
 
 def test_centres_are_dragged_as_any_point_bit_for_bit():
-    """Whether the kernels were compiled by this process or found in numba's cache."""
     rng = np.random.default_rng(0)
     start = rng.uniform(-50, 50, (18, 3)).astype(np.float32)
     shifts = rng.normal(0, 3, (18, 3)).astype(np.float32)

@@ -328,7 +328,7 @@ def read_only_home(place: Place) -> str:
     """`locate` with home and caches read-only"""
     with small_disk(place.folder / "home", "size=1m,ro") as home:
         environ = {"HOME": str(home), "XDG_CACHE_HOME": str(home / "c"), "MPLCONFIGDIR": ""}
-        environ |= {"NUMBA_CACHE_DIR": str(home / "numba"), "XDG_CONFIG_HOME": str(home)}
+        environ |= {"XDG_CONFIG_HOME": str(home)}
         ending = ended(place.locate(place.folder / "run"), environ=environ)
     return require(ending.code in (0, 4), f"exit {ending.code}: {ending.line}")
 

@@ -56,10 +56,20 @@ def nudged(motion: ElasticMotion, shift_mm: ArrayLike, turn_rad: ArrayLike) -> E
 
 
 def with_slope(field: kernels.DistanceField, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A field's distances at points (n, 3), and their slopes."""
-    lattice = field.values_mm, field.origin_mm, np.float32(field.spacing_mm)
-    rows = np.array([kernels.distance_at(*lattice, *point) for point in points], np.float32)
-    return rows[:, 0], rows[:, 1:]
+    """A field's distances at points (n, 3), and their slopes, both trilinear."""
+    nodes = np.arange(2)
+    distances, slopes = np.empty(len(points)), np.empty((len(points), 3))
+    for n, point in enumerate(points):
+        place = (point - field.origin_mm) / field.spacing_mm
+        place = np.clip(place, 0, np.array(field.values_mm.shape) - 1.001)
+        cell = place.astype(int)
+        values = field.values_mm[tuple(slice(start, start + 2) for start in cell)].astype(float)
+        shares = 1 - np.abs(nodes - (place - cell)[:, None])  # of both nodes, along each axis
+        distances[n] = np.einsum("ijk,i,j,k", values, *shares)
+        for axis in range(3):
+            along = [*shares[:axis], np.array([-1, 1]) / field.spacing_mm, *shares[axis + 1 :]]
+            slopes[n, axis] = np.einsum("ijk,i,j,k", values, *along)
+    return distances, slopes
 
 
 def refined(points_mm, start, config=GaussNewtonConfig()) -> RegistrationResult:  # noqa: B008

@@ -15,12 +15,12 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import label, maximum_filter
 from scipy.spatial.transform import Rotation
 
-from tumortrack.core.compiled import njit
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.mesh_query import contains, surface_distance
 from tumortrack.core.types import ORGAN, Anatomy, Mesh
 from tumortrack.imaging.raster import label_grid
+from tumortrack.native import F32, F64, kernel
 from tumortrack.report.metrics import distance_to_surface
 from tumortrack_resection.values import ResectionPlan
 
@@ -39,8 +39,11 @@ _TEARS = 0.5  # voxels: so thin a layer of tissue beside the kerf tears when the
 _REACH_MM = 10.0  # the cup holds nothing farther from where it was to touch
 _CUP_MM = 3.0  # it holds what lies so near to the first tissue that it meets
 _STAYS = 0.35  # of all tissue: a smaller part beside the held one is not what stays
-_PART = 4.0  # voxels: a box of voxels is looked through for so much of an axis
 _ML = 1e-3  # of a mm3
+
+# Ends of lines, reach -> voxels' squared distances are lowered to those from the lines, at least
+# where that is less than the reach; all in voxels.
+_approach = kernel("approach", F64["n", 2, 3], float, F32["i", "j", "k"].out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +129,7 @@ def cut(
     radius = swept.radius_mm / voxel_mm
     near = np.full(shape, (radius + 1) ** 2, np.float32)
     ends = transform_points(index_from_table, swept.ends_mm.reshape(-1, 3)).reshape(-1, 2, 3)
-    _approach(ends, radius + 1, near)
+    _approach(np.ascontiguousarray(ends, np.float64), radius + 1, near)
     kerf = tissue & (near <= radius**2)
     pieces = _pieces(tissue & ~kerf, near > (radius + _TEARS) ** 2)
     held = _held(pieces, transform_points(index_from_table, plan.grasp_mm[None])[0], voxel_mm)
@@ -187,29 +190,6 @@ def _grid(truth: Anatomy, voxel_mm: float) -> tuple[np.ndarray, tuple[int, int, 
     i, j, k = (np.ceil(corners.max(0) - low) + 2).astype(int).tolist()
     scaled = _ASKEW * voxel_mm
     return rigid(scaled, scaled @ low), (i, j, k)
-
-
-@njit(nogil=True)
-def _approach(ends, reach, near):  # type: ignore[no-untyped-def]
-    """Lower ``near`` (i, j, k), squared distances of voxels, to those from the lines between
-    ``ends`` (n, 2, 3), at least where that is less than ``reach``; all in voxels."""
-    for n in range(len(ends)):
-        start, way = ends[n, 0], ends[n, 1] - ends[n, 0]
-        squared = max((way**2).sum(), 1e-12)
-        parts = int(np.sqrt(squared) / _PART) + 1
-        low, stop = np.empty(3, np.int64), np.empty(3, np.int64)
-        for part in range(parts):
-            for a in range(3):
-                one, two = start[a] + way[a] * part / parts, start[a] + way[a] * (part + 1) / parts
-                low[a] = max(int(np.ceil(min(one, two) - reach)), 0)
-                stop[a] = min(int(np.floor(max(one, two) + reach)) + 1, near.shape[a])
-            for i in range(low[0], stop[0]):
-                for j in range(low[1], stop[1]):
-                    for k in range(low[2], stop[2]):
-                        x, y, z = i - start[0], j - start[1], k - start[2]
-                        t = min(max((x * way[0] + y * way[1] + z * way[2]) / squared, 0.0), 1.0)
-                        x, y, z = x - t * way[0], y - t * way[1], z - t * way[2]
-                        near[i, j, k] = min(near[i, j, k], x * x + y * y + z * z)
 
 
 def _pieces(tissue: Voxels, holds: Voxels) -> Int[np.ndarray, "i j k"]:

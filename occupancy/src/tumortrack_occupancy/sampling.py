@@ -6,13 +6,18 @@ points. Points come in batches (B, N, 3). Lengths are in whatever unit the point
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from tumortrack.core.compiled import njit
 from tumortrack.core.mesh_kernels import farthest
+from tumortrack.native import F32, I64, kernel
+
+# Points (clouds, 3, n), centres, squared radius -> indices
+_ball_query = kernel(
+    "ball_query", F32["b", 3, "n"].any_value, F32["b", 3, "m"].any_value, float,
+    I64["b", "m", "k"].out,
+)  # fmt: skip
 
 
 def farthest_points(points: Tensor, k: int) -> Tensor:
@@ -54,7 +59,7 @@ def ball_query(points: Tensor, centres: Tensor, radius: float, k: int) -> Tensor
     if compiled(points):
         indices = torch.empty((*centres.shape[:2], k), dtype=torch.int64)
         rows = _rows(points).numpy(), _rows(centres).numpy()
-        _ball_query(*rows, np.float32(radius**2), indices.numpy())
+        _ball_query(*rows, radius**2, indices.numpy())
         return indices
     across, down = _rows(points)[:, :, None].unbind(1), _rows(centres)[..., None].unbind(1)
     inside = _distance_2(*across, *down) <= radius**2
@@ -66,30 +71,6 @@ def ball_query(points: Tensor, centres: Tensor, radius: float, k: int) -> Tensor
     indices.scatter_(2, slot, torch.arange(n, device=points.device).expand_as(slot))
     missing = torch.arange(k, device=points.device) >= count
     return torch.where(missing, indices[:, :, :1], indices[:, :, :k])
-
-
-@njit(nogil=True)
-def _ball_query(points, centres, radius_2, indices):  # type: ignore[no-untyped-def]
-    """``ball_query`` of points (B, 3, N) and centres (B, 3, M), float32, into ``indices``."""
-    n_clouds, _, n = points.shape
-    k = indices.shape[2]
-    square = np.empty(n, np.float32)
-    for cloud in range(n_clouds):
-        x, y, z = points[cloud, 0], points[cloud, 1], points[cloud, 2]
-        for m in range(centres.shape[2]):
-            cx, cy, cz = centres[cloud, 0, m], centres[cloud, 1, m], centres[cloud, 2, m]
-            for i in range(n):
-                dx, dy, dz = x[i] - cx, y[i] - cy, z[i] - cz
-                square[i] = dx * dx + dy * dy + dz * dz
-            row = indices[cloud, m]
-            count = 0
-            for i in range(n):
-                if square[i] <= radius_2:
-                    row[count] = i
-                    count += 1
-                    if count == k:
-                        break
-            row[count:] = row[0] if count else 0
 
 
 def take(values: Tensor, indices: Tensor) -> Tensor:

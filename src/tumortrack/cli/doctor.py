@@ -1,5 +1,4 @@
-"""What this machine can do, how to install what is missing, and what it compiles once: `doctor`,
-`compile`."""
+"""What this machine can do, and how to install what is missing: `doctor`; and `compile`."""
 
 from __future__ import annotations
 
@@ -20,15 +19,12 @@ from packaging.requirements import Requirement
 from tyro.conf import Positional
 
 from tumortrack.cli.console import Device, say
-from tumortrack.core.errors import NoEstimate, TumortrackError
+from tumortrack.core.errors import TumortrackError
 from tumortrack.core.packages import to_install
 from tumortrack.core.process import available_cores
 from tumortrack.core.tables import read_table
 from tumortrack.models.method import GROUP
-from tumortrack.models.model import Model
-
-_GRID = 32  # of `compile`
-_VOXEL_MM, _UP_LPS = 1.5, (0.0, -1.0, 0.0)  # of the built-in phantom
+from tumortrack.native import LIBRARIES, library
 
 
 class _Table(msgspec.Struct, forbid_unknown_fields=True):
@@ -88,11 +84,10 @@ def _statuses() -> Iterator[Status]:
         yield "ok", "rclpy: ROS 2 through your own ROS"
     yield from _plug_ins()
     try:
-        from tumortrack.registration.kernels import carry
-
-        yield "ok", f"compiled kernels are kept in {carry.stats.cache_path}"
-    except Exception as error:  # of Numba, where no folder is writable
-        yield "BROKEN", f"compiled kernels: {error}; set NUMBA_CACHE_DIR to a writable folder"
+        library()
+        yield "ok", f"compiled kernels, in {LIBRARIES}"
+    except (ImportError, OSError) as error:
+        yield "BROKEN", f"compiled kernels: {error}"
 
 
 def _plug_ins() -> Iterator[Status]:
@@ -182,43 +177,21 @@ def _fault(needed: Requirement) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Compile:
-    """Compile what this machine needs, before the first patient or frame would wait for it.
+    """Nothing is left to compile: kernels are compiled when the package is installed.
 
     Attributes:
-        model: a case, or a folder that `train` wrote. Without one, what a new patient's model needs
-            is compiled as well, on the built-in phantom.
-        device: auto takes CUDA if there is a GPU.
+        model: a case, which gets its model if it has none, or a folder that `train` wrote.
+        device: not used any more.
     """
 
     model: Positional[Path | None] = None
     device: Device = "auto"
 
     def run(self) -> None:
-        """Fill numba's cache: one frame and one answer in full; models that place an organ are
-        shown their own."""
-        say("compiling ...")
-
-        from tumortrack.core.types import SensorCloud
+        """Say so."""
         from tumortrack.tracking.model_files import load_model
-        from tumortrack.tracking.tracker import Tracker
 
-        given = None if self.model is None else load_model(self.model, self.device)
-        tracker = Tracker(given or _phantom_model())
-        tracker.warm()
-        if tracker.anatomy_ct is not None:
-            organ = tracker.anatomy_ct.organ.vertices_mm
-            cloud = SensorCloud(organ - organ.mean(0) + [0, 0, 150])
-            with suppress(NoEstimate):  # seen from all sides at once it may fit nothing
-                tracker.locate(cloud, _GRID)
-        say("kernels: compiled and kept for every model of this machine.")
-
-
-def _phantom_model() -> Model:
-    """Of the built-in phantom; none of it stays."""
-    from tumortrack.imaging.surface import surfaces
-    from tumortrack.phantom.digital import PhantomParameters, phantom_labels
-    from tumortrack.registration.build import build_model
-    from tumortrack.tracking.presets import clinic
-
-    anatomy = surfaces(phantom_labels(PhantomParameters(), _VOXEL_MM))[0]
-    return build_model(anatomy, _UP_LPS, clinic(anatomy))
+        library()
+        if self.model is not None:
+            load_model(self.model, self.device)
+        say("nothing to compile: the kernels were compiled when tumortrack was installed.")

@@ -108,12 +108,10 @@ def _say_estimate(estimate: Estimate, located: Located) -> None:
 
 
 def _say_written(estimate: Estimate, located: Located, out: Path) -> None:
-    from tumortrack.registration.kernels import carry
     from tumortrack.report.seen import PAGE
 
     if located.points is not None:
         count, file = len(located.points.points_ct), out / "points.csv"
         say(f"{count} points of the CT: their places are in {file}")
     seconds = estimate.report.timings["total"]
-    compiled = ", with compiling, once on this machine" if carry.stats.cache_misses else ""
-    say(f"written to {out} (camera frame, mm) in {seconds:.2f} s{compiled}; look at {out / PAGE}.")
+    say(f"written to {out} (camera frame, mm) in {seconds:.2f} s; look at {out / PAGE}.")

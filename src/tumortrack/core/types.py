@@ -106,7 +106,7 @@ class Mesh:
     @cached_property
     def volume_mm3(self) -> float:
         """Signed volume (divergence theorem): positive where faces turn outward."""
-        from tumortrack.core.mesh_kernels import signed_volume  # compiled: imports numba
+        from tumortrack.core.mesh_kernels import signed_volume
 
         return float(signed_volume(self.vertices_mm, self.faces))
 

@@ -13,14 +13,15 @@ is seen the compliance says by how much the organ may be elsewhere.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
 from jaxtyping import Float, Float64, Int64
-from scipy.linalg import cho_factor, cho_solve
 
 from tumortrack.core.mesh_kernels import farthest
+from tumortrack.native import F64, kernel
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.evidence import Terms
 from tumortrack.registration.gauss_newton import RegistrationResult, prior_precision
@@ -267,7 +268,7 @@ class _Groups:
         by_states = by_library[:, POSE:]
         off = np.append(fit.moved, fit.motion.coefficients - body.mean)
         return cls(
-            distances_mm=distances_mm[:, 0],
+            distances_mm=np.ascontiguousarray(distances_mm[:, 0]),
             at_mean_mm=distances_mm[:, 0] - by_library @ off,
             by_pose_mm2=by_pose @ by_pose.T + shared,
             by_library_mm2=by_states @ body.covariance @ by_states.T,
@@ -288,24 +289,22 @@ class _Groups:
         """-2 log of the evidence of the compliance's deviation and the library's spread, up to a
         constant.
 
-        With distances d + J x, covariance C of x, and robust weights W, the likeliest x is -C J' z,
-        where z = (J C J' + 1 / W)^-1 d: a small system, since groups are fewer than unknowns. Its
-        determinant, times W's, is that of the posterior's precision over the prior's.
+        See ``native/fast/compliance.c``. Raises numpy.linalg.LinAlgError.
         """
         explained = self.by_pose_mm2 + spread**2 * self.by_library_mm2
         explained += std_mm**2 * self.by_compliance_mm2
-        residuals_mm = self.distances_mm
-        for _ in range(_LINEAR_STEPS):
-            roots = np.sqrt(self.weights) / (1 + (residuals_mm / self.width_mm) ** 2)
-            system = roots[:, None] * explained * roots + np.eye(len(roots))
-            factor = cho_factor(system, lower=True, check_finite=False)
-            pulls = roots * cho_solve(factor, roots * self.at_mean_mm, check_finite=False)
-            residuals_mm = self.at_mean_mm - explained @ pulls
-        width_mm = _JUDGED_WIDTH * self.width_mm
-        squares = (residuals_mm / width_mm) ** 2
-        misfit = (width_mm**2 * self.weights) @ (squares / (1 + squares))
-        determinant = 2 * np.log(np.diag(factor[0])).sum()
-        return float(misfit + pulls @ explained @ pulls + determinant)
+        given = self.weights, self.at_mean_mm, self.distances_mm, self.width_mm
+        room = np.empty_like(explained), np.empty((3, len(explained)))
+        cost = float(_linear_cost(explained, *given, _JUDGED_WIDTH, _LINEAR_STEPS, *room))
+        if not math.isfinite(cost):
+            raise np.linalg.LinAlgError("the evidence of a compliance cannot be told")
+        return cost
+
+
+_linear_cost = kernel(
+    "linear_cost", F64["n", "n"], F64["n"], F64["n"], F64["n"], F64["n"], float, int,
+    F64["n", "n"].out, F64[3, "n"].out, result=float,
+)  # fmt: skip
 
 
 def _blocks(a: Float64[np.ndarray, "p p"], b: Float64[np.ndarray, "c c"]) -> np.ndarray:

@@ -27,7 +27,6 @@ from tumortrack.registration.evidence import EvidenceTerms, Terms
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.rest_shape import RestShape
-from tumortrack.simulate.elastic.flow import LatticeField
 
 FARTHEST = 2.0  # widths of the robust kernel: what lies beyond weighs less than 1/25
 
@@ -110,20 +109,18 @@ class GaussNewton:
         body, count = rest.body, len(looks.points_mm)
         precision = prior_precision(rest, config)
         self._rest, self._looks, last_mm = rest, looks, looks.width_mm(config)
-        # Copies in C's order, and floats, whatever was given: the kernel is compiled for that, and
-        # would be once more for points that can't be written, or a whole number.
         self._problem = kernels.Problem(
-            modes=LatticeField(body.modes, body.origin_mm, np.float32(body.spacing_mm)),
+            modes=body.mode_field,
             center_ct=body.center_ct,
             distances=rest.distances[0],
             precision=precision,
             mean=body.mean,
             points=np.array(looks.points_mm, np.float32, order="C"),
             weight=looks.weight(config),
-            first_mm=max(float(config.first_mm), last_mm),
+            first_mm=max(config.first_mm, last_mm),
             last_mm=last_mm,
-            narrowing=float(config.narrowing),
-            enough_mm=float(config.enough_mm),
+            narrowing=config.narrowing,
+            enough_mm=config.enough_mm,
         )
         given = start.rotation, start.centre_mm, start.coefficients
         rotation, centre_mm, coefficients = (np.array(part, float, order="C") for part in given)

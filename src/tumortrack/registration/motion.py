@@ -13,9 +13,9 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Affine, Points, largest_std_of, rigid, std_of, turned_by
 from tumortrack.core.process import parallel_for
 from tumortrack.registration import kernels
-from tumortrack.registration.kernels import Flow, Pose
+from tumortrack.registration.kernels import Pose
 from tumortrack.registration.rest_shape import RestShape
-from tumortrack.simulate.elastic.flow import steps_for
+from tumortrack.simulate.elastic.flow import Flow, steps_for
 
 Moved = Float64[np.ndarray, "n 3"]
 _AT_ONCE = 4096  # points per thread
@@ -112,26 +112,24 @@ class ElasticMotion:
     def effects(self, points_ct: Points) -> Float64[np.ndarray, "n 3 p"]:
         """What shift, turn and coefficients each do to the place of points, organ's axes."""
         body, points = self.shape.body, np.array(points_ct, np.float32, order="C")
-        out = np.empty((len(points), 3, kernels.POSE + len(self.coefficients)))
-        kernels.effects(self._flow, body.modes, body.center_ct, points, out)
-        return out
+        return kernels.effects(self._flow, body.mode_field, body.center_ct, points)
 
     def residual_rows(self, points_camera: Points, surface: int = 0) -> Float32[np.ndarray, "n q"]:
         """What shift, turn and coefficients each do to the signed distance (mm) of points, carried
         back, to a surface at rest (the organ's; see ``RestShape.field``); that distance last."""
         body, points = self.shape.body, np.array(points_camera, np.float32, order="C")
-        pose = Pose(body.center_ct, self.rotation, self.centre_mm)
-        out = np.empty((len(points), kernels.POSE + len(self.coefficients) + 1), np.float32)
         distances = self.shape.field(surface)
-        kernels.residual_rows(body.modes, distances, self._opposite, pose, points, out)
-        return out
+        return kernels.residual_rows(body.mode_field, distances, self._opposite, self._pose, points)
 
     def _moved(self, kernel: Callable[..., None], flow: Flow, points_mm: Points) -> Moved:
-        points, out = _given(points_mm), np.empty((len(points_mm), 3))
-        rotation = np.ascontiguousarray(self.rotation)
-        pose = Pose(self.shape.body.center_ct, rotation, self.centre_mm)
+        points, out, pose = _given(points_mm), np.empty((len(points_mm), 3)), self._pose
         parallel_for(lambda part: kernel(flow, pose, points[part], out[part]), len(out), _AT_ONCE)
         return out
+
+    @property
+    def _pose(self) -> Pose:
+        given = self.shape.body.center_ct, self.rotation, self.centre_mm
+        return Pose(*(np.ascontiguousarray(part, float) for part in given))
 
     @cached_property
     def _flow(self) -> Flow:
@@ -146,8 +144,7 @@ class ElasticMotion:
 
 
 def _given(points_mm: Points) -> Float32[np.ndarray, "n 3"]:
-    """A copy, in C's order: for other arrays the kernels would be compiled once more. Raises
-    InputError for what would have them read beyond an array."""
+    """A copy, in C's order. Raises InputError for what no kernel takes."""
     points = np.array(points_mm, np.float32, order="C")
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"points are n x 3, one a row, mm; these have the shape {points.shape}.")

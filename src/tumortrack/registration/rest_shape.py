@@ -76,12 +76,11 @@ class RestShape:
     ) -> tuple[UInt8[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
         """Label of each point, and its distance (mm) to the nearest surface that bounds it."""
         labels = np.zeros(len(points_ct), np.uint8)
-        far = np.finfo(np.float32).max  # fast math knows no infinity
-        margin_mm = np.full(len(points_ct), far, np.float32)
+        margin_mm = np.full(len(points_ct), np.finfo(np.float32).max, np.float32)
 
         def mark_part(part: slice) -> None:
             for label, field in enumerate(self.distances, start=1):
-                mark(field, np.uint8(label), points_ct[part], labels[part], margin_mm[part])
+                mark(field, label, points_ct[part], labels[part], margin_mm[part])
 
         parallel_for(mark_part, len(points_ct), _AT_ONCE)
         return labels, margin_mm
@@ -89,9 +88,9 @@ class RestShape:
     def distances_mm(self, points_ct: Float64[np.ndarray, "n 3"], surface: int) -> np.ndarray:
         """Of points to a surface (see ``field``), negative inside; right near it."""
         points, inside = points_ct.astype(np.float32), np.zeros(len(points_ct), np.uint8)
-        away_mm = np.full(len(points), np.finfo(np.float32).max)
-        mark(self.field(surface), np.uint8(1), points, inside, away_mm)
-        return np.where(inside, -away_mm, away_mm)
+        away_mm = np.full(len(points), np.finfo(np.float32).max, np.float32)
+        mark(self.field(surface), 1, points, inside, away_mm)
+        return np.where(inside, -away_mm, away_mm).astype(float)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         arrays = {f"{_BODY}{name}": value for name, value in self.body.to_arrays().items()}

@@ -242,7 +242,7 @@ def corner_normals(mesh: Mesh) -> Float32[np.ndarray, "f 3 3"]:
     place[order] = np.append(0, np.cumsum(new))[: len(order)]
     weighted = triangles_of(mesh.vertices_mm, mesh.faces)[1]
     facing = weighted / np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-12)
-    normals = mean_normals(place[mesh.faces].ravel(), weighted, facing, np.cos(_CREASE_RAD))
+    normals = mean_normals(place[mesh.faces], weighted, facing, np.cos(_CREASE_RAD))
     _NORMALS[mesh] = normals
     return normals
 

@@ -21,12 +21,13 @@ from tumortrack.core.geometry import Affine, rigid, transform_points
 from tumortrack.core.rigid_fit import fit_over_volume, kabsch, matched_vertices
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.models.model import Model
-from tumortrack.registration.kernels import POSE, DistanceField, Flow, Pose, residual_rows
+from tumortrack.registration.kernels import POSE, DistanceField, Pose, residual_rows
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.rest_shape import RestShape
 from tumortrack.report import metrics
 from tumortrack.report.summary import RIVALS, judged_parts
 from tumortrack.sense.cloud import thin_cloud
+from tumortrack.simulate.elastic.flow import Flow, LatticeField
 from tumortrack.simulate.scene_folder import Scene
 
 _POINTS = 1000  # of the cloud, as many as the estimate uses
@@ -134,13 +135,12 @@ def rigid_fit(organ: DistanceField, cloud: SensorCloud, camera_from_ct: Affine) 
     Gauss-Newton on the points' distances to the surface, with the Geman-McClure kernel."""
     points_mm = thin_cloud(cloud, _POINTS, np.random.default_rng(0)).points_mm
     still = Flow(np.zeros((2, 2, 2, 3), np.float32), organ.origin_mm, np.float32(1), 1)
-    no_modes = np.zeros((2, 2, 2, 3, 0), np.float32)
+    none = LatticeField(np.zeros((2, 2, 2, 3, 0), np.float32), *still[1:3])
     center_ct = organ.origin_mm + organ.spacing_mm * (np.array(organ.values_mm.shape) - 1) / 2
     rotation = np.array(camera_from_ct[:3, :3])
     centre_mm = transform_points(camera_from_ct, center_ct[None])[0]
-    rows = np.empty((len(points_mm), POSE + 1), np.float32)
     for _ in range(_STEPS):
-        residual_rows(no_modes, organ, still, Pose(center_ct, rotation, centre_mm), points_mm, rows)
+        rows = residual_rows(none, organ, still, Pose(center_ct, rotation, centre_mm), points_mm)
         slopes, distances = rows[:, :POSE].astype(float), rows[:, -1].astype(float)
         weighed = slopes * (1 / (1 + (distances / _WIDTH_MM) ** 2) ** 2)[:, None]
         change = np.linalg.lstsq(weighed.T @ slopes, -(weighed.T @ distances), rcond=None)[0]

@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float32
 
-from tumortrack.core.compiled import njit
 from tumortrack.core.process import parallel_for
 from tumortrack.core.types import DepthFrame, PointNoise, SensorCloud
+from tumortrack.native import F32, I64, kernel
 from tumortrack.sense.cloud import thin_cloud
 from tumortrack.sense.measured_noise import (
     CROWD,
@@ -31,14 +31,19 @@ from tumortrack.sense.measured_noise import (
 # radius leave 0.1 mm of a ball of 25 mm.
 _LEFT_MM, _REACH_MM = 0.25, 3.0
 _STEEPEST = 2.0  # slope up to which neighbours are of one surface
-_WITHIN = 3.0  # standard deviations
-_FEWEST = 0.3  # of the window; else there is no surface round the pixel
 _AT_ONCE = 20  # rows
 _FEW_SCATTERED = 0.12  # share of a cloud's points: up to 0.08 lie alone where it is seen aslant
 _MOST_POINTS = 4000  # of a cloud that is cleaned
 _SMOOTHED = 1000  # of these: as many as a fit takes
 _NEIGHBOURS, _RADIUS_MM = (24, 120), 6.0  # a quadratic leaves 0.1 mm of a ball of 25 mm
 _NOISY_MM = 0.4  # less the fit's ``sigma_mm`` contains, and averaging takes 5 ms of each frame
+
+# Depths; rows and columns, which are some of theirs; reach, relative noise, slope; their depths.
+_smooth_depth = kernel(
+    "smooth_depth",
+    *(F32["height", "width"].any_value, I64["rows"], I64["columns"]),
+    *(int, float, float, F32["rows", "columns"].out),
+)
 
 
 def window_px(frame: DepthFrame, noise: DepthNoise) -> int:
@@ -55,14 +60,16 @@ def smoothed(
 ) -> Float32[np.ndarray, "h w"]:
     """The depths of the ``sampled`` rows and columns, each by the plane through its neighbours
     within ``reach`` pixels."""
-    height, width = frame.depth_mm.shape
-    rows, columns = (np.arange(n)[s] for n, s in zip((height, width), sampled, strict=True))
+    depth_mm = np.ascontiguousarray(frame.depth_mm)
+    rows, columns = (
+        np.ascontiguousarray(np.arange(n)[s]) for n, s in zip(depth_mm.shape, sampled, strict=True)
+    )
     out = np.empty((len(rows), len(columns)), np.float32)
     relative = noise.whole_mm / noise.depth_mm**2  # of disparities: it grows with the square
     slope = _STEEPEST / frame.intrinsics.fx
     parallel_for(
-        lambda part: _smooth(
-            frame.depth_mm, rows[part], columns, (reach, relative, slope), out[part]
+        lambda part: _smooth_depth(
+            depth_mm, rows[part], columns, reach, relative, slope, out[part]
         ),
         len(rows),
         _AT_ONCE,
@@ -112,58 +119,3 @@ def _smoothed(cloud: SensorCloud, noise: DepthNoise) -> tuple[SensorCloud, Point
     mean_mm = noise.white_mm / np.sqrt(len(points_mm))
     left = PointNoise(noise.white_mm, float(white_mm), float(mean_mm))
     return replace(cloud, points_mm=(drawn + off_mm).astype(np.float32)), left
-
-
-@njit(nogil=True)
-def _smooth(depth_mm, rows, columns, how, out):  # type: ignore[no-untyped-def]
-    reach, relative, slope = how
-    for n in range(len(rows)):
-        for m in range(len(columns)):
-            z = float(depth_mm[rows[n], columns[m]])
-            out[n, m] = z
-            if z > 0:
-                sigma = relative * z * z
-                # Of two noisy pixels, and of a slope; then about the plane that they show.
-                first, few = _plane(
-                    depth_mm, rows[n], columns[m], reach, (z, 0.0, 0.0), 4.2 * sigma, slope * z
-                )
-                plane, count = _plane(
-                    depth_mm, rows[n], columns[m], reach, first, _WITHIN * sigma, 0.0
-                )
-                if min(few, count) >= _FEWEST * (2 * reach + 1) ** 2:
-                    out[n, m] = plane[0]
-
-
-@njit(nogil=True)
-def _plane(depth_mm, row, column, reach, near, within, slope):  # type: ignore[no-untyped-def]
-    """The least-squares plane (depth here, by row, by column) through the neighbours that lie
-    ``within`` so many mm, and ``slope`` more for each pixel away, of the plane ``near``; and how
-    many they are."""
-    height, width = depth_mm.shape
-    count, su, sv, suu, suv, svv = 0, 0.0, 0.0, 0.0, 0.0, 0.0
-    sz, suz, svz = 0.0, 0.0, 0.0
-    for v in range(max(row - reach, 0), min(row + reach + 1, height)):
-        for u in range(max(column - reach, 0), min(column + reach + 1, width)):
-            y, x = float(v - row), float(u - column)
-            off = depth_mm[v, u] - (near[0] + near[1] * y + near[2] * x)
-            if abs(off) < within + slope * max(abs(y), abs(x)):  # NaN is not
-                count += 1
-                sv += y
-                su += x
-                svv += y * y
-                suv += y * x
-                suu += x * x
-                sz += off
-                svz += y * off
-                suz += x * off
-    # Of the normal equations, by Cramer's rule.
-    a, b, c = svv * suu - suv * suv, suv * su - sv * suu, sv * suv - svv * su
-    determinant = count * a + sv * b + su * c
-    if count < 3 or determinant < 1e-6 * count:
-        return near, 0
-    mean = (sz * a + svz * b + suz * c) / determinant
-    by_row = (sz * b + svz * (count * suu - su * su) + suz * (sv * su - count * suv)) / determinant
-    by_column = (
-        sz * c + svz * (sv * su - count * suv) + suz * (count * svv - sv * sv)
-    ) / determinant
-    return (near[0] + mean, near[1] + by_row, near[2] + by_column), count

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Real
 from scipy import ndimage
 
-from tumortrack.core.compiled import njit
 from tumortrack.core.geometry import perpendicular, triangles_of, unit
 from tumortrack.core.types import Mesh
 from tumortrack.imaging.raster import voxelise
@@ -101,9 +100,9 @@ class Cells:
         """Whether points lie in a cell that is inside."""
         index = np.rint((points_mm - self.origin_mm) / self.step_mm).astype(int)
         held = np.clip(index, 0, np.array(self.inside.shape) - 1)  # the grid's border is outside
-        return self.inside[tuple(np.moveaxis(held, -1, 0))]
+        return np.asarray(self.inside[tuple(np.moveaxis(held, -1, 0))])
 
-    def place_mm(self, index: Float[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
+    def place_mm(self, index: Real[np.ndarray, "*n 3"]) -> Float64[np.ndarray, "*n 3"]:
         return self.origin_mm + self.step_mm * index
 
 
@@ -177,20 +176,22 @@ def _membrane(start: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarra
     return heights
 
 
-@njit(nogil=True)
-def _relax(h, low, high, factor, sweeps):  # type: ignore[no-untyped-def]
-    """Projected successive over-relaxation in place, until nothing moves by a micrometre."""
-    ni, nj = h.shape
+def _relax(
+    heights: np.ndarray, low: np.ndarray, high: np.ndarray, factor: float, sweeps: int
+) -> None:
+    """Projected successive over-relaxation in place, until nothing moves by a micrometre. Nodes
+    take turns as a chessboard's colours."""
+    whole = np.pad(heights, 1, mode="reflect")  # beyond the edge stands the node's own image
+    here, white = whole[1:-1, 1:-1], np.indices(heights.shape).sum(0) % 2 == 0
     for _ in range(sweeps):
         most = 0.0
-        for i in range(ni):
-            for j in range(nj):
-                # Beyond the edge stands the node's own image.
-                total = h[i - 1 if i > 0 else 1, j] + h[i + 1 if i + 1 < ni else ni - 2, j]
-                total += h[i, j - 1 if j > 0 else 1] + h[i, j + 1 if j + 1 < nj else nj - 2]
-                new = h[i, j] + factor * (total / 4 - h[i, j])
-                new = min(max(new, low[i, j]), high[i, j])
-                most = max(most, abs(new - h[i, j]))
-                h[i, j] = new
+        for turn in (white, ~white):
+            total = whole[:-2, 1:-1] + whole[2:, 1:-1] + whole[1:-1, :-2] + whole[1:-1, 2:]
+            new = np.clip(here + factor * (total / 4 - here), low, high)
+            new = np.where(turn, new, here)
+            most = max(most, float(np.abs(new - here).max()))
+            here[...] = new
+            whole[[0, -1]], whole[:, [0, -1]] = whole[[2, -3]], whole[:, [2, -3]]
         if most < 1e-3:
             break
+    heights[...] = here

@@ -11,7 +11,7 @@ from pathlib import Path
 from tumortrack.core.process import available_cores
 
 _CPU_INFO = Path("/proc/cpuinfo")
-_LIBRARIES = ("tumortrack", "numba", "numpy", "scipy")
+_LIBRARIES = ("tumortrack", "numpy", "scipy")
 
 
 def describe_machine() -> dict[str, str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import resource
 import socket
-import sys
 import tempfile
 import threading
 import time
@@ -148,10 +147,8 @@ def _store(url: str) -> Store:
 
 
 def _use_one_core() -> None:
-    """Limit libraries that are loaded, and those that the work loads or starts."""
+    """Limit libraries that the work loads or starts."""
     os.environ["OMP_NUM_THREADS"] = "1"
-    if "numba" in sys.modules:
-        sys.modules["numba"].set_num_threads(1)
 
 
 class _Meter:

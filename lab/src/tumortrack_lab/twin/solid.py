@@ -16,10 +16,9 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float64, Int32
+from jaxtyping import Float, Float64
 from scipy.sparse import csr_matrix, diags
 
-from tumortrack.core.compiled import njit
 from tumortrack_lab.tets import TetMesh
 
 PER_TET = 0.05  # share of the bulk modulus that is kept per tetrahedron
@@ -29,14 +28,14 @@ Nodes = Float64[np.ndarray, "n 3"]
 
 class _RestElements(NamedTuple):
     """What the energy needs of the unloaded mesh. ``inner``: rows say how the corners 1, 2, 3 move
-    the field's gradient (1/mm); corner 0 balances them."""
+    the field's gradient (1/mm); corner 0 balances them. ``slopes`` @ nodes is that gradient, the
+    first axis of all tetrahedra before the second; ``quarters`` @ nodes the mean over corners."""
 
-    tets: Int32[np.ndarray, "t 4"]
     inner: Float64[np.ndarray, "t 3 3"]
-    volumes_mm3: Float64[np.ndarray, " t"]
-    node_volumes_mm3: Float64[np.ndarray, " n"]
-    shear_kpa: Float64[np.ndarray, " t"]
-    bulk_kpa: Float64[np.ndarray, " n"]
+    slopes: csr_matrix  # (3 t, n)
+    slopes_back: csr_matrix  # the transpose
+    quarters: csr_matrix  # (t, n)
+    quarters_back: csr_matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,17 +56,40 @@ class NeoHookeanSolid:
         return held / self.node_volumes_mm3
 
     @cached_property
+    def _own_kpa(self) -> Float64[np.ndarray, " t"]:
+        """Bulk modulus that is kept per tetrahedron."""
+        return PER_TET * self.bulk_kpa[self.mesh.tets].mean(1)
+
+    @cached_property
     def _rest(self) -> _RestElements:
-        corners = self.mesh.nodes_mm[self.mesh.tets]
-        edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
-        inner, shear = np.ascontiguousarray(np.linalg.inv(edges)), np.asarray(self.shear_kpa, float)
-        volumes = self.mesh.volumes_mm3, self.node_volumes_mm3
-        return _RestElements(self.mesh.tets, inner, *volumes, shear, self.bulk_kpa)
+        tets, n, t = self.mesh.tets, len(self.mesh.nodes_mm), len(self.mesh.tets)
+        corners = self.mesh.nodes_mm[tets]
+        inner = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
+        shape = np.concatenate([-inner.sum(1, keepdims=True), inner], axis=1)  # (t, 4, 3)
+        values, columns = shape.transpose(2, 0, 1).ravel(), np.tile(tets.ravel(), 3)
+        slopes = csr_matrix((values, columns, np.arange(0, 12 * t + 1, 4)), (3 * t, n))
+        starts = np.arange(0, 4 * t + 1, 4)
+        quarters = csr_matrix((np.full(4 * t, 0.25), tets.ravel(), starts), (t, n))
+        return _RestElements(inner, slopes, slopes.T.tocsr(), quarters, quarters.T.tocsr())
 
     def energy(self, nodes_mm: Nodes) -> tuple[float, Nodes]:
         """Elastic energy (uJ) and its gradient (mN); infinite where an element has turned over."""
-        gradient = np.zeros_like(nodes_mm)
-        return _neo_hookean(nodes_mm, self._rest, gradient), gradient
+        rest, volumes, t = self._rest, self.mesh.volumes_mm3, len(self.mesh.tets)
+        F = np.ascontiguousarray((rest.slopes @ nodes_mm).T).reshape(3, 3, t)
+        cofactors = _cofactors(F)
+        J = (F[0] * cofactors[0]).sum(0)
+        if not (J > 0).all():
+            return np.inf, np.zeros_like(nodes_mm)
+        swelling = rest.quarters_back @ (J * volumes) / self.node_volumes_mm3 - 1
+        pressure = (1 - PER_TET) * self.bulk_kpa * swelling
+        scale, trace = self.shear_kpa * np.cbrt(J) ** -2, (F * F).sum((0, 1))
+        own = self._own_kpa * (J - 1)
+        energy = pressure * self.node_volumes_mm3 @ swelling
+        energy += volumes @ (scale * trace - 3 * self.shear_kpa + own * (J - 1))
+        p = rest.quarters @ pressure + own - scale * trace / (3 * J)
+        # First Piola-Kirchhoff stress; dJ/dF is the cofactor matrix.
+        stress = (volumes * scale) * F + (volumes * p) * cofactors
+        return float(energy) / 2, rest.slopes_back @ stress.reshape(3, 3 * t).T
 
     def stretch(self, nodes_mm: Nodes) -> Float64[np.ndarray, " t"]:
         """J of each tetrahedron: present over rest volume."""
@@ -99,57 +121,8 @@ class NeoHookeanSolid:
         return (stiffness + swelling.T @ held @ swelling).tocsr()
 
 
-@njit()
-def _deformation(nodes, tet, inner, out):  # type: ignore[no-untyped-def]
-    """Fill the deformation gradient, return its determinant."""
-    for i in range(3):
-        start = nodes[tet[0], i]
-        u, v, w = nodes[tet[1], i] - start, nodes[tet[2], i] - start, nodes[tet[3], i] - start
-        for j in range(3):
-            out[i, j] = u * inner[0, j] + v * inner[1, j] + w * inner[2, j]
-    return (
-        out[0, 0] * (out[1, 1] * out[2, 2] - out[1, 2] * out[2, 1])
-        - out[0, 1] * (out[1, 0] * out[2, 2] - out[1, 2] * out[2, 0])
-        + out[0, 2] * (out[1, 0] * out[2, 1] - out[1, 1] * out[2, 0])
-    )
-
-
-@njit()
-def _neo_hookean(nodes, rest, gradient):  # type: ignore[no-untyped-def]
-    """The energy; fills its gradient."""
-    tets, inner, volume, node_volume, shear, bulk = rest
-    F, P = np.empty((3, 3)), np.empty((3, 3))
-    pressure = np.zeros(len(nodes))  # first the present volume of each node
-    for t in range(len(tets)):
-        J = _deformation(nodes, tets[t], inner[t], F)
-        if not J > 0:
-            return np.inf
-        for k in range(4):
-            pressure[tets[t, k]] += J * volume[t] / 4
-    energy = 0.0
-    for n in range(len(nodes)):
-        swelling = pressure[n] / node_volume[n] - 1
-        pressure[n] = (1 - PER_TET) * bulk[n] * swelling
-        energy += pressure[n] * swelling * node_volume[n] / 2
-    for t in range(len(tets)):
-        tet = tets[t]
-        J = _deformation(nodes, tet, inner[t], F)
-        trace = (F * F).sum()
-        scale = J ** (-2 / 3)
-        own = PER_TET * (bulk[tet[0]] + bulk[tet[1]] + bulk[tet[2]] + bulk[tet[3]]) / 4
-        energy += volume[t] * (shear[t] * (scale * trace - 3) + own * (J - 1) ** 2) / 2
-        p = (pressure[tet[0]] + pressure[tet[1]] + pressure[tet[2]] + pressure[tet[3]]) / 4
-        p += own * (J - 1) - shear[t] * scale * trace / (3 * J)
-        for i in range(3):  # first Piola-Kirchhoff stress; dJ/dF is the cofactor matrix
-            a, b = (i + 1) % 3, (i + 2) % 3
-            for j in range(3):
-                c, d = (j + 1) % 3, (j + 2) % 3
-                cofactor = F[a, c] * F[b, d] - F[a, d] * F[b, c]
-                P[i, j] = volume[t] * (shear[t] * scale * F[i, j] + p * cofactor)
-        for k in range(3):
-            for i in range(3):
-                force = P[i, 0] * inner[t, k, 0] + P[i, 1] * inner[t, k, 1]
-                force += P[i, 2] * inner[t, k, 2]
-                gradient[tet[k + 1], i] += force
-                gradient[tet[0], i] -= force
-    return energy
+def _cofactors(matrices: Float64[np.ndarray, "3 3 t"]) -> Float64[np.ndarray, "3 3 t"]:
+    """The determinants' slopes."""
+    one, two = matrices[[1, 2, 0]], matrices[[2, 0, 1]]
+    next_, last = [1, 2, 0], [2, 0, 1]
+    return one[:, next_] * two[:, last] - one[:, last] * two[:, next_]

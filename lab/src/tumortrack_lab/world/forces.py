@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float, Float64, Int
 from scipy.sparse import bsr_matrix, csr_matrix, eye, kron
 
-from tumortrack.core.compiled import njit
 from tumortrack.core.mesh_query import contains, surface_distance
 from tumortrack.core.types import Mesh
+from tumortrack.native import F64, kernel
 from tumortrack_lab.tets import Embedding, TetMesh
 from tumortrack_lab.twin.equilibrium import Nodes, Points
 from tumortrack_lab.twin.solid import NeoHookeanSolid
@@ -24,6 +24,11 @@ _STEADY_MN_MM = 2e4
 _STICK_MM = 0.2  # a smaller slip meets less than full friction: keeps the energy smooth
 FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])  # of a tetrahedron, outward
 _GRID_MM, _GRID_ROOM_MM = 2.5, 25.0
+
+# Values of a grid, places in its steps -> cubic B-spline and its gradient.
+_spline = kernel(
+    "bed_spline", F64["i", "j", "k"].any_value, F64["m", 3], F64["m"].out, F64["m", 3].out
+)
 
 
 @runtime_checkable
@@ -258,6 +263,10 @@ class Bed:
     rim_mm: float = 0.0
     sunk_mm: Float[np.ndarray, " m"] | float = 0.0  # of each point at rest, by rough meshes alone
 
+    def __post_init__(self) -> None:
+        if min(self.values.shape) < 4:
+            raise ValueError(f"a cubic spline of {self.values.shape} values; 4 along each axis")
+
     @classmethod
     def of(cls, organ: Mesh) -> Bed:
         low, high = organ.box_mm + [[-_GRID_ROOM_MM], [_GRID_ROOM_MM]]
@@ -284,32 +293,3 @@ class Bed:
         over = above > -outside
         normal = np.where(over[:, None], [0.0, 0.0, 1.0], -slope)
         return np.where(over, above, -outside) - self.sunk_mm, normal
-
-
-@njit()
-def _spline(values, places, out, slope):  # type: ignore[no-untyped-def]
-    """Uniform cubic B-spline with the grid's values as its coefficients, and its gradient."""
-    w, d = np.empty((3, 4)), np.empty((3, 4))
-    base = np.empty(3, np.int64)
-    for n in range(len(places)):
-        for a in range(3):
-            x = min(max(places[n, a], 1.0), values.shape[a] - 2.000001)
-            base[a] = int(x) - 1
-            t = x - int(x)
-            w[a, 0], w[a, 3] = (1 - t) ** 3 / 6, t**3 / 6
-            w[a, 1] = (3 * t**3 - 6 * t**2 + 4) / 6
-            w[a, 2] = 1 - w[a, 0] - w[a, 1] - w[a, 3]
-            d[a, 0], d[a, 3] = -((1 - t) ** 2) / 2, t**2 / 2
-            d[a, 1] = (3 * t**2 - 4 * t) / 2
-            d[a, 2] = -d[a, 0] - d[a, 1] - d[a, 3]
-        total, sx, sy, sz = 0.0, 0.0, 0.0, 0.0
-        for i in range(4):
-            for j in range(4):
-                for k in range(4):
-                    value = values[base[0] + i, base[1] + j, base[2] + k]
-                    total += value * w[0, i] * w[1, j] * w[2, k]
-                    sx += value * d[0, i] * w[1, j] * w[2, k]
-                    sy += value * w[0, i] * d[1, j] * w[2, k]
-                    sz += value * w[0, i] * w[1, j] * d[2, k]
-        out[n] = total
-        slope[n, 0], slope[n, 1], slope[n, 2] = sx, sy, sz

@@ -9,15 +9,17 @@ import numpy as np
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.report import Finding
+from tumortrack.native import F64, I32, U8, kernel
 from tumortrack.sense.region.hints import Hints
 from tumortrack.sense.region.pieces import find_edges, find_pieces
 from tumortrack.sense.region.working_image import (
+    DEPTH,
     LAST_BOX,
     PIECES,
+    TANGENTS,
     THIN,
     RegionConfig,
     WorkingImage,
-    jit,
 )
 
 # Whether folds are edges, and the opening, times ``opening_mm``: the last is wider than fingers.
@@ -25,7 +27,6 @@ _SPLITS = (False, 1.0), (True, 1.0), (True, 1.7), (True, 2.8)
 _CLEARLY = 1.1  # a wider opening must raise the score by this factor
 _PICK_REACH_MM = 10.0  # from the picked point to its piece
 _OTHERS, _LEAST_OTHER = 3, 0.1  # pieces that may be it instead; score over the best of them
-_SAME_MM = 5.0  # largest step in depth between neighbouring pixels of one surface
 _CUT = 0.1  # ``_Sizes.cut`` from which a piece leaves the image
 _POOR = 0.5  # likeness of an organ below which a guess is doubtful
 _WHOLLY = 0.97  # share of a piece in the last box from which it is part of the organ
@@ -34,6 +35,21 @@ _FAR_SIDE = 0.4  # of the box's depth: its far side shows the ground, the near s
 _THICK_PART_MM = 9.0  # thinner pieces in the last box are no part of the organ
 _AIMED = 0.4  # at this angle (tangent) from the optical axis a piece is half as likely the organ
 _THICK = 0.8  # of an organ's shortest extent: thinner pieces are likely fingers or shafts
+
+_PIECES = I32["height", "width"]  # from ``label``: fewer than are told, 0 none
+# Depths, pieces, tangents, product of the focal lengths, a box's corners; areas in it.
+_areas = kernel(
+    "area_inside",
+    *(DEPTH, _PIECES, *TANGENTS, float),
+    *((float,) * 3, (float,) * 3, F64["pieces"].out),
+)
+# Depths, px to the nearest edge, states, pieces, tangents, focal lengths, state of what goes on;
+# a row for each piece.
+_measures = kernel(
+    "measure_pieces",
+    *(DEPTH, DEPTH, U8["height", "width"], _PIECES, *TANGENTS, float, float, int),
+    F64["pieces", 17].out,
+)
 
 
 def choose_pieces(image: WorkingImage, config: RegionConfig, hints: Hints) -> list[np.ndarray]:
@@ -51,7 +67,7 @@ def choose_pieces(image: WorkingImage, config: RegionConfig, hints: Hints) -> li
         if folds and wider == 1:
             edges = find_edges(image, config, folds)
         pieces, count = find_pieces(image, edges, config, wider)
-        sizes = _measure(image.depth_mm, edges[1], image.taken, pieces, image.pinhole, count)
+        sizes = _measure(image, edges[1], pieces, count)
         poor = _POOR if folds else 1.0  # beside something large a fold may hide the organ in it
         chosen, score, doubtful = _chosen(image, pieces, sizes, config, hints, poor)
         if best is None or score > _CLEARLY * best[0]:
@@ -66,7 +82,7 @@ def choose_pieces(image: WorkingImage, config: RegionConfig, hints: Hints) -> li
         low, high = np.sort(np.asarray(hints.last_box_mm, np.float64), axis=0)
         high[2] -= _FAR_SIDE * (high[2] - low[2])
         box = low - _BOX_MM, high + _BOX_MM
-        area = _area_inside(image.depth_mm, pieces, image.pinhole, *box, len(chosen))
+        area = _area_inside(image, pieces, *box, len(chosen))
         parts = (area > _WHOLLY * sizes.area_mm2) & (sizes.thick_mm > _THICK_PART_MM) & (area > 0)
         chosen = chosen | parts
     image.remove(~chosen[pieces], PIECES)
@@ -79,14 +95,12 @@ def choose_pieces(image: WorkingImage, config: RegionConfig, hints: Hints) -> li
 
 class _Sizes(NamedTuple):
     """Measures of every piece (count + 1,); entry 0 is not used. ``area_mm2``: across the line of
-    sight. ``low_mm``, ``high_mm`` (count + 1, 4): its ends along four directions of the image;
-    ``wide_mm``: the longest extent. ``cut``: 0..1, how much of it continues outside the examined
-    part: the width there over the square root of the area. ``thick_mm``: diameter of its largest
-    inscribed disc. ``aside``: tangent of the angle between its middle and the optical axis."""
+    sight. ``wide_mm``: the longest extent along four directions of the image. ``cut``: 0..1, how
+    much of it continues outside the examined part: the width there over the square root of the
+    area. ``thick_mm``: diameter of its largest inscribed disc. ``aside``: tangent of the angle
+    between its middle and the optical axis."""
 
     area_mm2: np.ndarray
-    low_mm: np.ndarray
-    high_mm: np.ndarray
     wide_mm: np.ndarray
     cut: np.ndarray
     thick_mm: np.ndarray
@@ -141,7 +155,7 @@ def _hinted(image: WorkingImage, pieces: np.ndarray, sizes: _Sizes, hints: Hints
     if hints.last_box_mm is None:
         return None
     low, high = np.sort(np.asarray(hints.last_box_mm, np.float64), axis=0)
-    area = _area_inside(image.depth_mm, pieces, image.pinhole, low, high, len(sizes.cut))
+    area = _area_inside(image, pieces, low, high, len(sizes.cut))
     inside = area**2 / np.maximum(sizes.area_mm2, 1e-9)  # the surroundings reach in, too
     return int(inside.argmax()) if inside.max() > 0 else None
 
@@ -155,71 +169,20 @@ def _like_an_organ(sizes: _Sizes, config: RegionConfig) -> np.ndarray:
     return fits * thick * aimed * (1 - 0.95 * sizes.cut) ** 4 * (sizes.wide_mm > low)
 
 
-@jit
-def _area_inside(depth_mm, pieces, pinhole, low, high, count):  # type: ignore[no-untyped-def]
-    fx, fy, cx, cy = pinhole
+def _area_inside(
+    image: WorkingImage, pieces: np.ndarray, low: np.ndarray, high: np.ndarray, count: int
+) -> np.ndarray:
+    """Each piece's area (count,) within a box, mm^2."""
     area = np.zeros(count)
-    for v in range(len(depth_mm)):
-        for u in range(depth_mm.shape[1]):
-            if pieces[v, u]:
-                z = depth_mm[v, u]
-                x, y = (u - cx) / fx * z, (v - cy) / fy * z
-                if low[2] < z < high[2] and low[1] < y < high[1] and low[0] < x < high[0]:
-                    area[pieces[v, u]] += z * z / (fx * fy)
+    focal = image.pinhole.fx * image.pinhole.fy
+    _areas(image.depth_mm, pieces, *image.tangents, focal, low, high, area)
     return area
 
 
-@jit
-def _measure(depth_mm, distance, taken, pieces, pinhole, count):  # type: ignore[no-untyped-def]
-    fx, fy, cx, cy = pinhole
-    height, width = depth_mm.shape
-    area, border, disc = np.zeros(count + 1), np.zeros(count + 1), np.zeros(count + 1)
-    middle, pixels = np.zeros((count + 1, 2)), np.zeros(count + 1)
-    low, high = np.full((count + 1, 4), np.inf), np.full((count + 1, 4), -np.inf)
-    for v in range(height):
-        for u in range(width):
-            piece = pieces[v, u]
-            if piece == 0:
-                continue
-            z = depth_mm[v, u]
-            area[piece] += z * z / (fx * fy)
-            pixels[piece] += 1
-            middle[piece, 0] += (u - cx) / fx
-            middle[piece, 1] += (v - cy) / fy
-            disc[piece] = max(disc[piece], distance[v, u] * z / fx)
-            inside = 0 < v < height - 1 and 0 < u < width - 1
-            if (
-                inside
-                and pieces[v - 1, u] == pieces[v + 1, u] == piece
-                and pieces[v, u - 1] == pieces[v, u + 1] == piece
-            ):
-                continue  # the extent is reached at the outline
-            if (
-                _goes_on(depth_mm, taken, z, v - 1, u)
-                or _goes_on(depth_mm, taken, z, v + 1, u)
-                or _goes_on(depth_mm, taken, z, v, u - 1)
-                or _goes_on(depth_mm, taken, z, v, u + 1)
-            ):
-                border[piece] += z / fx
-            x, y = (u - cx) / fx * z, (v - cy) / fy * z
-            along = (x, y, (x + y) * 0.7071, (x - y) * 0.7071)
-            for k in range(4):
-                low[piece, k] = min(low[piece, k], along[k])
-                high[piece, k] = max(high[piece, k], along[k])
-    wide, cut = np.zeros(count + 1), np.zeros(count + 1)
-    for piece in range(1, count + 1):
-        if area[piece] > 0:
-            wide[piece] = (high[piece] - low[piece]).max()
-            cut[piece] = min(border[piece] / np.sqrt(area[piece]), 1.0)
-    aside = np.sqrt((middle**2).sum(1)) / np.maximum(pixels, 1)
-    return _Sizes(area, low, high, wide, cut, 2 * disc, aside)
-
-
-@jit
-def _goes_on(depth_mm, taken, z, v, u):  # type: ignore[no-untyped-def]
-    """Whether a piece continues at a pixel beyond the image's border or the last estimate's
-    surroundings. Range, box and mask don't count: they are meant to cut around the organ."""
-    height, width = taken.shape
-    if not (0 <= v < height and 0 <= u < width):
-        return True
-    return taken[v, u] == LAST_BOX and abs(depth_mm[v, u] - z) < _SAME_MM
+def _measure(image: WorkingImage, distance: np.ndarray, pieces: np.ndarray, count: int) -> _Sizes:
+    """``distance``: px to the nearest edge."""
+    out = np.empty((count + 1, 17))
+    camera = *image.tangents, *image.pinhole[:2]
+    _measures(image.depth_mm, distance, image.taken, pieces, *camera, LAST_BOX, out)
+    area, _, _, _, _, thick, wide, cut, aside = out.T[:9]
+    return _Sizes(area, wide, cut, thick, aside)

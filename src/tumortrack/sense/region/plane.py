@@ -12,16 +12,35 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tumortrack.sense.region.working_image import NO_RETURN, PLANE, RegionConfig, WorkingImage, jit
+from tumortrack.native import F32, F64, I64, U8, kernel
+from tumortrack.sense.region.working_image import (
+    DEPTH,
+    NO_RETURN,
+    PLANE,
+    TANGENTS,
+    RegionConfig,
+    WorkingImage,
+)
 
 _SAMPLED = 1200  # pixels
 _TRIES = 150
 _BEYOND_MM = 120.0  # points up to this far beyond the range are used for the fit
-_STEEPEST = 0.35  # cosine of the largest angle between the plane's normal and the optical axis
 _DEEPEST_MM = 60.0  # no organ is deeper: what lies farther behind a plane is no part of it
-_BEHIND_COST = 2.0  # one point behind the plane cancels this many on it
 _MOST_BEHIND = 0.03  # share of the points on it; more is a cavity, in which the organ may lie
 _NARROWEST_MM = 120.0  # extent of a background across its long side
+
+# Points; triples of them, which come from their number; tolerance and greatest depth of an organ;
+# the best plane's normal and offset. Returns its score.
+_consensus = kernel(
+    "plane_consensus",
+    *(F32["n", 3].any_value, I64["tries", 3], (float, float), F32[3].out, F64[1].out),
+    result=float,
+)
+# Depths, states, height over the plane by column and row, its offset, tolerance; the step.
+_remove_below = kernel(
+    "remove_below",
+    *(DEPTH, U8["height", "width"].out, *TANGENTS, float, float, int),
+)
 
 
 class Plane(NamedTuple):
@@ -38,8 +57,10 @@ class Plane(NamedTuple):
 def remove_plane(image: WorkingImage, config: RegionConfig, rng: np.random.Generator) -> None:
     """Remove the background plane and what lies behind it, if there is one."""
     if (plane := find_plane(image, config, rng)) is not None:
-        normal, offset, half_mm = plane[:3]
-        _remove_below(image.depth_mm, image.taken, image.pinhole, normal, offset, half_mm)
+        (x, y, z), offset, half_mm = plane[:3]
+        (height, width), (fx, fy, cx, cy) = image.depth_mm.shape, image.pinhole
+        right, down = x * (np.arange(width) - cx) / fx, y * (np.arange(height) - cy) / fy + z
+        _remove_below(image.depth_mm, image.taken, right, down, offset, half_mm, PLANE)
 
 
 def find_plane(image: WorkingImage, config: RegionConfig, rng: np.random.Generator) -> Plane | None:
@@ -50,10 +71,11 @@ def find_plane(image: WorkingImage, config: RegionConfig, rng: np.random.Generat
     # The drape's unevenness plus three standard deviations of noise.
     most_mm = config.plane_mm + 3 * config.noise_mm * float(np.median(points[:, 2]) / 150) ** 2
     triples = rng.integers(len(points), size=(_TRIES, 3))
-    score, normal, offset = _consensus(points, triples, most_mm)
+    normal, offsets = np.zeros(3, np.float32), np.zeros(1)
+    score = _consensus(points, triples, (most_mm, _DEEPEST_MM), normal, offsets)
     if score < config.plane_share / 2 * len(points):
         return None
-    half_mm = most_mm
+    half_mm, offset = most_mm, float(offsets[0])
     for _ in range(3):
         height = points @ normal - offset
         inliers = points[np.abs(height) < half_mm]
@@ -89,58 +111,3 @@ def _sampled_points(image: WorkingImage, far_mm: float, rng: np.random.Generator
     row, column = np.divmod(pixel[valid], width)
     (fx, fy, cx, cy), z = image.pinhole, z[valid]
     return np.stack([(column - cx) / fx * z, (row - cy) / fy * z, z], axis=1).astype(np.float32)
-
-
-@jit
-def _consensus(points, triples, tolerance):  # type: ignore[no-untyped-def]
-    """Score, normal and offset of the best plane through three points. A tenth of the points
-    suffices to reject hopeless planes."""
-    best, best_offset = -np.inf, 0.0
-    best_normal = np.zeros(3, np.float32)
-    few = len(points) // 10
-    for t in range(len(triples)):
-        a, b, c = points[triples[t, 0]], points[triples[t, 1]], points[triples[t, 2]]
-        bx, by, bz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-        cx, cy, cz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
-        nx, ny, nz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
-        length = np.sqrt(nx * nx + ny * ny + nz * nz)
-        if length < 100.0 or abs(nz) < _STEEPEST * length:  # mm^2: slivers are ill-conditioned
-            continue
-        to_camera = -1 / length if nz > 0 else 1 / length
-        nx, ny, nz = nx * to_camera, ny * to_camera, nz * to_camera
-        offset = nx * a[0] + ny * a[1] + nz * a[2]
-        score = _score(points[:few], nx, ny, nz, offset, tolerance)
-        if score < 0.05 * best:
-            continue
-        score += _score(points[few:], nx, ny, nz, offset, tolerance)
-        if score > best:
-            best, best_offset = score, offset
-            best_normal[0], best_normal[1], best_normal[2] = nx, ny, nz
-    return best, best_normal, best_offset
-
-
-@jit
-def _score(points, nx, ny, nz, offset, tolerance):  # type: ignore[no-untyped-def]
-    score = np.float32(0)
-    for i in range(len(points)):
-        height = nx * points[i, 0] + ny * points[i, 1] + nz * points[i, 2] - offset
-        share = height / tolerance
-        if abs(share) < 1:
-            score += 1 - share * share
-        elif -_DEEPEST_MM < height < 0:
-            score -= np.float32(_BEHIND_COST)
-    return score
-
-
-@jit
-def _remove_below(depth_mm, taken, pinhole, normal, offset, half):  # type: ignore[no-untyped-def]
-    """Remove what lies less than ``half`` (mm) above the plane."""
-    fx, fy, cx, cy = pinhole
-    height, width = depth_mm.shape
-    for v in range(height):
-        across = normal[1] * (v - cy) / fy + normal[2]
-        for u in range(width):
-            if taken[v, u] == 0:
-                above = depth_mm[v, u] * (normal[0] * (u - cx) / fx + across) - offset
-                if above < half:
-                    taken[v, u] = PLANE

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from tumortrack.core.compiled import njit
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.native import F32, F64, I32, I64, U8, kernel
 from tumortrack.sense.camera import Pinhole, deproject_pixels
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.measured_noise import DepthNoise
@@ -19,7 +20,6 @@ from tumortrack.sense.smoothing import smoothed, window_px
 
 MOST_PIXELS = 110_000  # 424 x 240 as it is, of 848 x 480 every second pixel
 _POINTS_PER_PIXEL = 2
-_WIDEST = 2.0  # tangent of the largest angle from the optical axis in a rasterised cloud
 _BINS = 1000  # of the histogram of tangents
 
 # Each pixel's state: still the organ's, or the step that removed it.
@@ -29,7 +29,26 @@ STEPS = (
     *("colour", "plane", "flying", "thin", "other pieces"),
 )
 
-jit = njit(nogil=True)
+# Of a working image: depths (NaN: no return), and what ``tangents`` has.
+DEPTH = F32["height", "width"].any_value
+TANGENTS = F64["width"].any_value, F64["height"].any_value
+
+# Depths, states, tangents of the columns and rows, the box's corners; the step that removes.
+_keep_inside = kernel(
+    "keep_inside",
+    *(DEPTH, U8["height", "width"].out, *TANGENTS, (float,) * 3, (float,) * 3, int),
+)
+# Points; their tangents, room for two histograms, and ends of the tangents.
+_cloud_tangents = kernel(
+    "cloud_tangents",
+    *(F32["n", 3].any_value, F32["n", 2].out, I64[2, _BINS].out, F64[3, 2].out),
+)
+# Tangents, depths and camera; the image, and each point's pixel.
+_rasterise = kernel(
+    "rasterise",
+    *(F32["n", 2].any_value, F32["n"].any_value, (float,) * 4),
+    *(F32["height", "width"].out, I32["n"].out),
+)
 
 
 class RegionConfig(Config, frozen=True, kw_only=True):
@@ -116,6 +135,12 @@ class WorkingImage:
         """Width of a pixel at distance 1."""
         return 2 / (self.pinhole.fx + self.pinhole.fy)
 
+    @cached_property
+    def tangents(self) -> tuple[np.ndarray, np.ndarray]:
+        """x / z of the columns (w,) and y / z of the rows (h,)."""
+        (height, width), (fx, fy, cx, cy) = self.depth_mm.shape, self.pinhole
+        return (np.arange(width) - cx) / fx, (np.arange(height) - cy) / fy
+
     @property
     def pixel_mm(self) -> float:
         """Width of a pixel at the median depth."""
@@ -193,8 +218,8 @@ def image_of_frame(
 def image_of_cloud(cloud: SensorCloud) -> WorkingImage:
     """A cloud, in any order, as a pinhole camera at its origin sees it: the nearest point in each
     pixel. Points at or behind the camera's centre are left out, and so are occluded ones."""
-    points_mm = cloud.points_mm
-    tangents, low, high, inner = _spread(points_mm.copy())
+    points_mm = np.ascontiguousarray(cloud.points_mm)
+    tangents, (low, high, inner) = _tangents(points_mm)
     z = points_mm[:, 2].copy()
     # Stray points widen the image, but don't coarsen it.
     pixels = max(len(points_mm) / _POINTS_PER_PIXEL, 64.0)
@@ -202,7 +227,9 @@ def image_of_cloud(cloud: SensorCloud) -> WorkingImage:
     size = float(np.sqrt(max(np.prod(inner + 1e-3) / pixels, most)))
     width, height = (int(n) for n in np.floor((high - low) / size) + 1)
     pinhole = Pinhole(1 / size, 1 / size, float(-low[0] / size), float(-low[1] / size))
-    depth_mm, pixel = _rasterise(tangents, z, pinhole, (height, width))
+    depth_mm = np.full((height, width), np.nan, np.float32)
+    pixel = np.empty(len(z), np.int32)
+    _rasterise(tangents, z, pinhole, depth_mm, pixel)
     taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
 
     def remaining(taken: np.ndarray) -> np.ndarray:
@@ -213,74 +240,15 @@ def image_of_cloud(cloud: SensorCloud) -> WorkingImage:
     return WorkingImage(depth_mm, taken, pinhole, remaining, lambda index: points_mm[index])
 
 
+def _tangents(points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """x / z and y / z (n, 2), NaN for points behind the camera or too far aside; and (3, 2) their
+    minima, maxima, and the spread of the middle 96 %."""
+    tangents, ends = np.empty((len(points_mm), 2), np.float32), np.empty((3, 2))
+    _cloud_tangents(points_mm, tangents, np.empty((2, _BINS), np.int64), ends)
+    return tangents, ends
+
+
 def keep_inside(image: WorkingImage, corners_mm: np.ndarray, step: int) -> None:
     """Remove everything outside a box: two corners (2, 3), camera frame, mm, in any order."""
     low, high = np.sort(np.asarray(corners_mm, np.float64), axis=0)
-    _keep_inside(image.depth_mm, image.taken, image.pinhole, low, high, step)
-
-
-@jit
-def _keep_inside(depth_mm, taken, pinhole, low, high, step):  # type: ignore[no-untyped-def]
-    fx, fy, cx, cy = pinhole
-    for v in range(len(depth_mm)):
-        slope_y = (v - cy) / fy
-        for u in range(depth_mm.shape[1]):
-            z = depth_mm[v, u]
-            x, y = (u - cx) / fx * z, slope_y * z
-            inside = low[2] < z < high[2] and low[1] < y < high[1] and low[0] < x < high[0]
-            if not taken[v, u] and not inside:
-                taken[v, u] = step
-
-
-@jit
-def _spread(points_mm):  # type: ignore[no-untyped-def]
-    """x / z and y / z (n, 2), NaN for points behind the camera or too far aside; their minima and
-    maxima (2,); and the spread of the middle 96 % (2,), from a histogram, so that the order of the
-    points doesn't matter."""
-    tangents = np.full((len(points_mm), 2), np.nan, np.float32)
-    low, high, count = np.full(2, np.inf), np.full(2, -np.inf), 0
-    for i in range(len(points_mm)):
-        z = points_mm[i, 2]
-        if z > 1.0:
-            x, y = points_mm[i, 0] / z, points_mm[i, 1] / z
-            if abs(x) < _WIDEST and abs(y) < _WIDEST:
-                tangents[i, 0], tangents[i, 1] = x, y
-                low[0], low[1] = min(low[0], x), min(low[1], y)
-                high[0], high[1] = max(high[0], x), max(high[1], y)
-                count += 1
-    if count == 0:
-        return tangents, np.zeros(2), np.zeros(2), np.zeros(2)
-    return tangents, low, high, _inner_spread(tangents, low, high, count)
-
-
-@jit
-def _inner_spread(tangents, low, high, count):  # type: ignore[no-untyped-def]
-    inner, histogram = np.zeros(2), np.zeros((2, _BINS), np.int64)
-    for i in range(len(tangents)):
-        if not np.isnan(tangents[i, 0]):
-            for k in range(2):
-                share = (tangents[i, k] - low[k]) / max(high[k] - low[k], 1e-9)
-                histogram[k, min(int(share * _BINS), _BINS - 1)] += 1
-    for k in range(2):
-        total = 0
-        for points_in_bin in histogram[k]:
-            total += points_in_bin
-            if 0.02 * count < total < 0.98 * count:
-                inner[k] += (high[k] - low[k]) / _BINS
-    return inner
-
-
-@jit
-def _rasterise(tangents, z_mm, pinhole, shape):  # type: ignore[no-untyped-def]
-    """The nearest depth in each pixel (h, w), and each point's pixel (n,), -1 outside."""
-    fx, fy, cx, cy = pinhole
-    depth_mm = np.full(shape[0] * shape[1], np.nan, np.float32)
-    pixel = np.full(len(z_mm), -1, np.int32)
-    for i in range(len(z_mm)):
-        if not np.isnan(tangents[i, 0]):
-            u, v = int(fx * tangents[i, 0] + cx + 0.5), int(fy * tangents[i, 1] + cy + 0.5)
-            if 0 <= u < shape[1] and 0 <= v < shape[0]:
-                place = pixel[i] = v * shape[1] + u
-                if not depth_mm[place] <= z_mm[i]:
-                    depth_mm[place] = z_mm[i]
-    return depth_mm.reshape(shape), pixel
+    _keep_inside(image.depth_mm, image.taken, *image.tangents, low, high, step)

@@ -11,16 +11,15 @@ table's heading literally. See docs/method.md.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float32
 
-from tumortrack.core.compiled import njit
 from tumortrack.core.config import Config
 from tumortrack.core.errors import TumortrackError
+from tumortrack.native import F32, kernel
 from tumortrack.simulate.deform.base import Points, View
 
 # (largest distance in mm, falloff, repeats), table "compare_deformations"
@@ -35,6 +34,13 @@ CONFIGURATIONS: dict[int, tuple[Step, ...]] = {
 CONFIGURATIONS[6] = (*CONFIGURATIONS[2], *CONFIGURATIONS[3][1:])
 
 
+_SHIFTS = F32["k", 3], F32["k"]  # and their falloffs
+# Drags one after the other: points, centres and shifts -> dragged points.
+_drag = kernel("drag", F32["n", 3], (F32["k", 3], *_SHIFTS), F32["n", 3].out)
+# Where drags start -> their centres, each dragged by those before it.
+_drag_centres = kernel("drag_centres", F32["k", 3], (F32["k", 3].out, *_SHIFTS))
+
+
 @dataclass(frozen=True, eq=False)
 class Drags:
     """Successive drags: centre (CT frame, after the drags before), shift, falloff; all in mm."""
@@ -44,7 +50,10 @@ class Drags:
     sigmas_mm: Float32[np.ndarray, " k"]
 
     def apply(self, points_ct: Points) -> Float32[np.ndarray, "n 3"]:
-        return _drag(points_ct.astype(np.float32), self.centres_ct, self.shifts_mm, self.sigmas_mm)
+        points = np.ascontiguousarray(points_ct, np.float32)
+        out = np.empty_like(points)
+        _drag(points, (self.centres_ct, self.shifts_mm, self.sigmas_mm), out)
+        return out
 
     def record(self) -> dict[str, Any]:
         return {"kind": "drag"} | {name: value.tolist() for name, value in vars(self).items()}
@@ -83,65 +92,8 @@ def _visible_vertices(view: View, count: int, rng: np.random.Generator) -> np.nd
     raise TumortrackError("the camera sees none of the organ's vertices; check the pose range.")
 
 
-_BLOCK = 1024  # points whose coordinates stay in the L1 cache through all drags
-_SMALLEST = np.float32(-12.0)  # exponents below, factors of 6e-6, count as zero
-_LOG2_E = np.float32(1.4426950408889634)
-# 2^r = sum of (r ln 2)^k / k!, within 1.2e-7 for r in -0.5 ... 0.5
-_T1, _T2, _T3, _T4, _T5, _T6 = (
-    np.float32(math.log(2) ** k / math.factorial(k)) for k in range(1, 7)
-)
-
-
-# Fast math: the last digits (1e-5 mm) may depend on the processor, so that a scene replays bit for
-# bit on the machine that made it, and elsewhere to that precision.
-@njit(nogil=True, fastmath=True, inline="always")
-def _exp(x):  # type: ignore[no-untyped-def]
-    """exp(x) for -80 < x <= 0. Unlike the C library's it is vectorized over points."""
-    binary = x * _LOG2_E
-    whole = np.floor(binary + np.float32(0.5))
-    r = binary - whole
-    power = r * (_T1 + r * (_T2 + r * (_T3 + r * (_T4 + r * (_T5 + r * _T6)))))
-    exponent = (np.int32(whole) + np.int32(127)) << np.int32(23)
-    return (np.float32(1.0) + power) * np.int32(exponent).view(np.float32)
-
-
-@njit(nogil=True, fastmath=True, inline="always")
-def _carry(points, centres, shifts, sigmas, out):  # type: ignore[no-untyped-def]
-    n = len(points)
-    x, y, z = np.empty((3, min(n, _BLOCK)), np.float32)
-    for start in range(0, n, _BLOCK):
-        size = min(_BLOCK, n - start)
-        for i in range(size):
-            x[i], y[i], z[i] = points[start + i]
-        for k in range(len(centres)):
-            scale = np.float32(-0.5) / (sigmas[k] * sigmas[k])
-            cx, cy, cz = centres[k]
-            sx, sy, sz = shifts[k]
-            for i in range(size):
-                dx, dy, dz = x[i] - cx, y[i] - cy, z[i] - cz
-                exponent = scale * (dx * dx + dy * dy + dz * dz)
-                factor = _exp(max(exponent, _SMALLEST))
-                factor = factor if exponent > _SMALLEST else np.float32(0.0)
-                x[i] += factor * sx
-                y[i] += factor * sy
-                z[i] += factor * sz
-        for i in range(size):
-            out[start + i, 0], out[start + i, 1], out[start + i, 2] = x[i], y[i], z[i]
-
-
-# Neither of the next two calls the other: whether a call is inlined, which in fast math moves last
-# digits, depends on whether this process compiled them or loaded them from numba's cache.
-@njit(nogil=True, fastmath=True)
-def _drag(points, centres, shifts, sigmas):  # type: ignore[no-untyped-def]
-    out = np.empty_like(points)
-    _carry(points, centres, shifts, sigmas, out)
-    return out
-
-
-@njit(nogil=True, fastmath=True)
-def _centres(start, shifts, sigmas):  # type: ignore[no-untyped-def]
+def _centres(start: np.ndarray, shifts: np.ndarray, sigmas: np.ndarray) -> np.ndarray:
     """A vertex is dragged from where earlier drags left it."""
-    centres = start.copy()
-    for k in range(1, len(start)):
-        _carry(start[k : k + 1], centres[:k], shifts[:k], sigmas[:k], centres[k : k + 1])
+    centres = np.empty_like(start)
+    _drag_centres(start, (centres, shifts, sigmas))
     return centres

@@ -13,9 +13,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from tumortrack.core.compiled import njit
 from tumortrack.core.config import Config
+from tumortrack.native import F32, F64, kernel
 from tumortrack.simulate.deform.base import Points, View
+
+# Points -> centre + matrix (offset + (offset . along)^2 bend), where offset = point - centre.
+_stretch = kernel("stretch", F64["n", 3], F64[3], F64[3, 3], F64[3], F64[3], F32["n", 3].out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +33,11 @@ class Stretch:
     reach_mm: float
 
     def apply(self, points_ct: Points) -> Float32[np.ndarray, "n 3"]:
+        points, matrix = (np.ascontiguousarray(x, np.float64) for x in (points_ct, self.matrix))
         bend = self.along / self.reach_mm, self.sagitta_mm * self.across
-        return _moved(points_ct, self.centre_ct, self.matrix, *bend)
+        out = np.empty(points.shape, np.float32)
+        _stretch(points, self.centre_ct, matrix, *bend, out)
+        return out
 
     def record(self) -> dict[str, Any]:
         numbers = {name: np.asarray(value).tolist() for name, value in vars(self).items()}
@@ -58,21 +64,3 @@ class StretchConfig(Config, frozen=True, tag="stretch"):
         sagitta_mm = float(rng.uniform(-self.sagitta_mm, self.sagitta_mm))
         reach_mm = float(np.max(upper - lower) / 2)
         return Stretch((lower + upper) / 2, matrix, along, across, sagitta_mm, reach_mm)
-
-
-@njit(nogil=True)
-def _moved(points, centre, matrix, along, bend):  # type: ignore[no-untyped-def]
-    """One pass over the points, five times as fast as NumPy with its array per term."""
-    out = np.empty(points.shape, np.float32)
-    cx, cy, cz = centre
-    ax, ay, az = along
-    bx, by, bz = bend
-    for i in range(len(points)):
-        x, y, z = points[i, 0] - cx, points[i, 1] - cy, points[i, 2] - cz
-        reach = x * ax + y * ay + z * az
-        far = reach * reach
-        x, y, z = x + far * bx, y + far * by, z + far * bz
-        out[i, 0] = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + cx
-        out[i, 1] = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + cy
-        out[i, 2] = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + cz
-    return out

@@ -121,10 +121,15 @@ class ElasticBody:
 
     def modes_at(self, points: Points) -> Float32[np.ndarray, "n 3 m"]:
         """The modes at points of the CT frame."""
-        place, field = np.ascontiguousarray(points, np.float32), self._field(self.modes)
+        place, field = np.ascontiguousarray(points, np.float32), self.mode_field
         axes = np.eye(3, dtype=np.float32)
         along = [project(field, place, np.tile(axis, (len(place), 1))) for axis in axes]
         return np.stack(along, 1)
+
+    @property
+    def mode_field(self) -> LatticeField:
+        """The modes on their lattice."""
+        return self._field(self.modes)
 
     def _field(self, values: Float32[np.ndarray, "i j k ..."]) -> LatticeField:
         return LatticeField(values, self.origin_mm, np.float32(self.spacing_mm))

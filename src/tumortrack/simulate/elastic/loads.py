@@ -17,15 +17,13 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from tumortrack.core.compiled import njit
 from tumortrack.core.geometry import perpendicular, unit
 from tumortrack.core.process import parallel_map
+from tumortrack.native import F64, kernel
 from tumortrack.simulate.elastic.modes import ReducedModel
 
 KPA = 1e-3  # N/mm2
 Vector = Float64[np.ndarray, " 3"]
-_MOST_STEPS = 20
-_CONVERGED_MM = 1e-2
 _OBSTACLE = 100 * KPA  # N/mm3, of plates and instruments
 _GRIP = 50 * KPA  # N/mm3, of a held region
 _WEIGHT = 1.05e-6 * 9.81  # N/mm3
@@ -57,8 +55,12 @@ class ReducedProblem:
 
     def tie(self, along: Vector, target_mm: float, springs: Float64[np.ndarray, " p"]) -> None:
         """Add springs (N/mm) that hold the patches at a target along a direction, both ways."""
-        system, loads = (self.stiffness, self.forces), (springs * target_mm, springs)
-        self.additions.append(lambda: _add_springs(*system, self.organ.along(along), *loads))
+
+        def add() -> None:
+            rows = np.ascontiguousarray(self.organ.along(along))
+            _add_springs(self.stiffness, self.forces, rows, springs * target_mm, springs)
+
+        self.additions.append(add)
 
     def press(self, outward: Vector, height_mm: float, foot: Float64[np.ndarray, " p"]) -> None:
         """A rigid obstacle comes from the direction ``outward`` (unit vector) and stops at
@@ -103,65 +105,30 @@ class ReducedProblem:
         return z if converged else None
 
 
-# Loops instead of BLAS, as matrices are small: BLAS would wake every thread for each product, which
-# on a busy machine takes many times longer than the product. And most springs are open.
-@njit(nogil=True)
-def _equilibrium(stiffness, forces, rows, depth, springs):  # type: ignore[no-untyped-def]
-    z = np.zeros(len(forces))
-    for step in range(_MOST_STEPS):
-        closed, loads = np.zeros(len(rows)), np.zeros(len(rows))
-        for p in range(len(rows)):
-            penetration = depth[p]
-            for a in range(len(z)):
-                penetration += rows[p, a] * z[a]
-            if penetration > 0:
-                closed[p] = springs[p]
-                loads[p] = -springs[p] * depth[p]
-        matrix, solution = stiffness.copy(), forces.copy()
-        _add_springs(matrix, solution, rows, loads, closed)
-        _solve(matrix, solution)
-        farthest = 0.0
-        for a in range(len(z)):
-            move = solution[a] - z[a]
-            farthest = max(farthest, abs(move))
-            z[a] += move if step < 6 else 0.6 * move  # damps contacts that open and close in turns
-        if farthest < _CONVERGED_MM:
-            return solution, True
-    return z, False
+# The room that they work in comes from here; see native/exact/loads.c.
+_MATRIX, _SPRINGS = F64["m", "m"], (F64["p", "m"], F64["p"], F64["p"])
+# In place: matrix += rows' diag(springs) rows, its lower triangle; right += rows' loads.
+_add_springs = kernel("add_springs", _MATRIX.out, F64["m"].out, *_SPRINGS)
+_solve_contacts = kernel(
+    "equilibrium", _MATRIX, F64["m"], *_SPRINGS, _MATRIX.out, *[F64["p"].out] * 2,
+    *[F64["m"].out] * 2, result=int,
+)  # fmt: skip
 
 
-@njit(nogil=True)
-def _add_springs(matrix, right, rows, loads, springs):  # type: ignore[no-untyped-def]
-    """In place: matrix += rows' diag(springs) rows, its lower triangle only, as ``_solve`` needs no
-    more; right += rows' loads."""
-    for p in range(len(rows)):
-        if springs[p] == 0.0:
-            continue
-        for a in range(len(right)):
-            force = springs[p] * rows[p, a]
-            right[a] += rows[p, a] * loads[p]
-            for b in range(a + 1):
-                matrix[a, b] += force * rows[p, b]
-
-
-@njit(nogil=True)
-def _solve(matrix, right):  # type: ignore[no-untyped-def]
-    """right = inverse(matrix) right, by Cholesky; both are overwritten."""
-    n = len(right)
-    for i in range(n):
-        for j in range(i + 1):
-            total = matrix[i, j]
-            for k in range(j):
-                total -= matrix[i, k] * matrix[j, k]
-            matrix[i, j] = np.sqrt(total) if i == j else total / matrix[j, j]
-        total = right[i]
-        for k in range(i):
-            total -= matrix[i, k] * right[k]
-        right[i] = total / matrix[i, i]
-    for i in range(n - 1, -1, -1):
-        right[i] /= matrix[i, i]
-        for k in range(i):
-            right[k] -= matrix[i, k] * right[i]
+def _equilibrium(
+    stiffness: np.ndarray,
+    forces: np.ndarray,
+    rows: np.ndarray,
+    depth_mm: np.ndarray,
+    springs: np.ndarray,
+) -> tuple[np.ndarray, bool]:
+    """The unknowns, and whether the contacts came to rest."""
+    n, p = len(forces), len(rows)
+    work = np.empty((n, n)), np.empty(p), np.empty(p)
+    z, solution = np.empty(n), np.empty(n)
+    contacts = np.ascontiguousarray(rows), depth_mm, springs
+    converged = _solve_contacts(stiffness, forces, *contacts, *work, z, solution)
+    return (solution, True) if converged else (z, False)
 
 
 def plate(problem: ReducedProblem, rng: np.random.Generator) -> None:

@@ -1,0 +1,144 @@
+"""Calls into the compiled kernels: what is refused before anything native runs; and their build."""
+
+import ctypes
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tumortrack import native
+from tumortrack.native import F32, F64, I32, kernel
+
+ROOT = Path(__file__).parents[2]
+SOURCES = ROOT / "src" / "tumortrack" / "native"
+
+# of registration.kernels: margins, one over each standard deviation, which of them, chances
+CHANCES = kernel("probabilities", F32["n"], F64["s"], I32["n"], F32["n"].out, result=int)
+
+
+def given(n=5):
+    return [np.ones(n, np.float32), np.ones(3), np.zeros(n, np.int32), np.empty(n, np.float32)]
+
+
+def test_a_call_fills_what_it_is_given():
+    arrays = given()
+    assert CHANCES(*arrays) == 0
+    np.testing.assert_allclose(arrays[3], 0.841345, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("which", "wrong"),
+    [
+        (0, np.ones(5)),  # another type
+        (0, np.ones((5, 1), np.float32)),  # another number of axes
+        (0, np.ones(4, np.float32)),  # not as many as there are places for
+        (0, np.ones(10, np.float32)[::2]),  # not one after the other
+        (2, [0] * 5),
+        (3, np.empty(6, np.float32)),
+        (3, np.frombuffer(bytes(20), np.float32)),  # cannot be written
+    ],
+)
+def test_arrays_that_are_not_as_declared_are_refused(which, wrong):
+    arrays = given()
+    arrays[which] = wrong
+    with pytest.raises(TypeError, match="probabilities: "):
+        CHANCES(*arrays)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_values_that_are_not_finite_are_refused_where_they_are_not_declared(value):
+    arrays = given()
+    arrays[0][2] = value
+    with pytest.raises(ValueError, match="finite"):
+        CHANCES(*arrays)
+    as_it_is = kernel("probabilities", F32["n"].any_value, F64["s"], I32["n"], F32["n"].out)
+    as_it_is(*arrays)  # and numbers whose squares are not finite are
+    arrays[0][2] = 1e30
+    CHANCES(*arrays)
+    assert arrays[3][2] == 1
+
+
+def test_a_wrong_number_of_arguments_and_a_wrong_declaration_are_refused():
+    with pytest.raises(ValueError, match="probabilities"):
+        CHANCES(*given()[:3])
+    with pytest.raises(ImportError, match="bytes declared"):
+        kernel("probabilities", F32["n"], F64["s"], I32["n"])(*given()[:3])
+    with pytest.raises(AttributeError):
+        kernel("no_such_kernel", int)(1)
+
+
+def test_arrays_that_cannot_be_written_and_empty_ones_are_read():
+    arrays = given()
+    for array in arrays[:3]:
+        array.flags.writeable = False
+    assert CHANCES(*arrays) == 0
+    assert CHANCES(*given(0)) == 0
+
+
+def test_every_kernel_of_the_library_is_declared_somewhere():
+    """What nothing calls is gone."""
+    defined = {
+        name
+        for source in SOURCES.rglob("*.c")
+        for name in re.findall(r"^KERNEL\(\w+, (\w+)\)", source.read_text("utf-8"), re.MULTILINE)
+    }
+    declared = {
+        name
+        for package in ROOT.glob("**/src/tumortrack*")
+        for source in package.rglob("*.py")
+        for name in re.findall(r'\bkernel\(\s*"(\w+)"', source.read_text("utf-8"))
+    }
+    assert len(defined) > 20
+    assert defined == declared
+    for name in defined:
+        assert ctypes.c_int64.in_dll(native.library(), f"{name}_bytes").value > 0
+
+
+def test_a_library_for_another_processor_is_not_used(monkeypatch):
+    monkeypatch.setattr(native, "_features", lambda: frozenset({"fpu"}))
+    native.library.cache_clear()
+    try:
+        with pytest.raises(ImportError, match="another processor"):
+            native.library()
+    finally:
+        native.library.cache_clear()
+    monkeypatch.setattr(native, "LIBRARIES", ROOT / "docs")
+    try:
+        with pytest.raises(ImportError, match="not built"):
+            native.library()
+    finally:
+        native.library.cache_clear()
+
+
+def build(*arguments, **environment):
+    command = [sys.executable, ROOT / "tools" / "build_backend.py", *arguments]
+    environ = {**os.environ, **environment}
+    return subprocess.run(command, env=environ, capture_output=True, text=True, check=False)
+
+
+def test_the_build_says_what_it_compiles_with_and_what_to_do_without(tmp_path):
+    assert build("--compiler", CC="some cc").stdout == "some cc\n"
+    (tmp_path / "setuptools").symlink_to(Path(__import__("setuptools").__file__).parent)
+    without = {"PATH": str(tmp_path), "CC": ""}
+    said = build("--compiler", **without)
+    if said.returncode:  # ziglang is not installed here
+        assert "gcc" in said.stderr
+        assert "ziglang==" in said.stderr
+    else:
+        assert "ziglang" in said.stdout
+
+
+def test_pip_and_make_build_with_the_same_ziglang():
+    sys.path.insert(0, str(ROOT / "tools"))
+    try:
+        import build_backend
+    finally:
+        sys.path.pop(0)
+    assert (ROOT / "requirements" / "compiler.txt").read_text().startswith(build_backend.ZIGLANG)
+    system = tomllib.loads((ROOT / "pyproject.toml").read_text())["build-system"]
+    assert system["build-backend"] == "build_backend"

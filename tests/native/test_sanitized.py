@@ -1,0 +1,45 @@
+"""The kernels' tests once more, on kernels in which every access to an array is checked."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).parents[2]
+TESTS = (
+    "tests/native/test_native.py",
+    "tests/core/test_mesh_kernels.py",
+    "tests/sense/test_render.py",
+    "tests/sense/test_sense_kernels.py",
+    "tests/report/test_renderer_kernels.py",
+    "tests/registration/test_bend.py",
+    "occupancy/tests/test_lattice_kernels.py",
+    "lab/tests/test_lab_kernels.py",
+)
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc's sanitizers")
+def test_no_kernel_reads_or_writes_beyond_its_arrays():
+    command = [sys.executable, ROOT / "tests" / "support" / "sanitized.py", *TESTS]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc's sanitizers")
+def test_an_access_beyond_an_array_is_seen(tmp_path):
+    """The check checks: a declaration that hands over too short an array ends the process."""
+    (tmp_path / "test_beyond.py").write_text(
+        "import numpy as np\n"
+        "from tumortrack.native import F32, F64, I32, kernel\n"
+        "def test_beyond():\n"
+        "    chances = kernel('probabilities', F32['n'], F64['s'], I32['m'], F32['n'].out)\n"
+        "    ones, which = np.ones(5000, np.float32), np.zeros(3, np.int32)\n"
+        "    chances(ones, np.ones(1), which, np.empty(5000, np.float32))\n"
+    )
+    command = [sys.executable, ROOT / "tests" / "support" / "sanitized.py", tmp_path]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode != 0
+    assert "AddressSanitizer" in done.stdout + done.stderr
