@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Does a fresh clone work with every Python that this machine has (besides make's own)? For each:
 # installation, a short demo, `doctor`, quick tests; by a user without privileges where that user
-# can run this Python, with an empty home, no caches and none of this shell's settings.
+# can run this Python, with an empty home, no caches, no compiler (ziglang then builds the kernels)
+# and none of this shell's settings.
 # tools/pythons.sh [PYTHON ...]   those, instead of all that are found
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -22,6 +23,10 @@ fi
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 chmod 755 "$work"
+mkdir "$work/bin"
+for program in /usr/local/bin/* /usr/bin/* /bin/*; do
+  case ${program##*/} in cc | gcc* | g++* | c++* | c[89]9* | cpp* | clang* | *-gcc* | *-g++* | tcc) ;; *) ln -sf "$program" "$work/bin/" ;; esac
+done
 for version in $(printf '%s\n' "${!pythons[@]}" | sort -V); do
   python=${pythons[$version]} home="$work/$version"
   mkdir "$home"
@@ -36,7 +41,7 @@ for version in $(printf '%s\n' "${!pythons[@]}" | sort -V); do
       chown -R 65534:65534 "$home"
     fi
   fi
-  clean=(env -i "HOME=$home" "PATH=/usr/local/bin:/usr/bin:/bin" "LANG=C.UTF-8")
+  clean=(env -i "HOME=$home" "PATH=$work/bin" "LANG=C.UTF-8")
   for name in HTTPS_PROXY HTTP_PROXY NO_PROXY https_proxy http_proxy no_proxy; do
     [ -z "${!name:-}" ] || clean+=("$name=${!name}")
   done
