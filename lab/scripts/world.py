@@ -132,11 +132,16 @@ def _plans(options: Options, world: World, model: Path, made: list[str]) -> Made
         about = case, method, [variant], view, 160, options.out / "plans" / name
         rows += measured(*about, resection.cut_one, **resection.cutting())
         say(f"planned {name} ({method.name})")
-    good = {row["variant"] for row in rows if row.get("good")}
+    for other in options.beside:
+        for path in sorted((other / "plans").rglob("*.json")):
+            rows += store.read_json(path)["rows"]
+    seen = {(row["case"], row["variant"]) for row in rows}
+    good = {(row["case"], row["variant"]) for row in rows if row.get("good")}
     for row in rows:
-        row["case"] = "an answer" if row["variant"] in good else "no answer"
+        is_good = (row["case"], row["variant"]) in good
+        row["case"] = "a good answer" if is_good else "a poor answer, or none"
     cuts, refused = resection.tables_of(rows)
-    counts = f"Scenes: {len(made)}, with an answer: {len(good)}."
+    counts = f"Scenes: {len(seen)}, with a good answer: {len(good)}."
     return f"{counts}\n\n{resection.summary(cuts)}", {
         "cuts": ("What the cuts did", cuts), "refused": ("Why there was no plan", refused)
     }  # fmt: skip
