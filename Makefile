@@ -24,7 +24,7 @@ COMPILER = $(BIN)/python tools/build_backend.py --compiler >/dev/null 2>&1 || { 
 NO_COMPILER = $(BIN)/pip uninstall --quiet --yes ziglang 2>/dev/null
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian clients demo test quick pythons pytest test-hard check attack fuzz crash replay fingerprint figures bench soak wheel lock licences audit results real world sequences plans pull pulls bounds evidence noise rehearsal population site pictures clean
+.PHONY: help setup debian clients demo demo-scenes test quick pythons pytest test-hard check attack fuzz crash replay fingerprint figures bench soak wheel lock licences audit results real world sequences plans pull pulls bounds evidence noise rehearsal population site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -64,7 +64,7 @@ $(TOOLS): requirements/tools.txt
 	.tools/bin/$(PIP) --require-hashes -r requirements/tools.txt
 	touch $@
 
-demo: $(TRACKER) $(KERNELS)  ## install the tracker (without PyTorch), then CT -> tumors located in unseen deformed scenes (ARGS="--scenes 2": two of them)
+demo: $(TRACKER) $(KERNELS)  ## install the tracker (without PyTorch), then CT -> tumors located in ten scenes of other physics (ARGS="--scenes 2": the first two)
 	$(BIN)/tumortrack demo $(ARGS)
 
 check: setup  ## lint, types, import order, licences, figures in the pages
@@ -142,6 +142,9 @@ real: setup  ## real kidneys, breathing lungs, silicone: ARGS='DATA', a folder o
 world: setup  ## scenes of wider physics, noise and views, and how a model does in them (ARGS="CASE OUT --model MODEL")
 	$(BIN)/python lab/scripts/world.py $(ARGS)
 
+demo-scenes: setup  ## the ten scenes that the package brings, from the twin and the world (ARGS=OUT: what takes long is kept there)
+	$(BIN)/python lab/scripts/demo.py $(ARGS)
+
 sequences: setup  ## an organ pressed, pushed, rolled, breathing, turned over, and how it is followed (ARGS="CASE OUT --model MODEL")
 	$(BIN)/python lab/scripts/sequences.py $(ARGS)
 
@@ -170,8 +173,8 @@ rehearsal: setup  ## the experiment on a bench that does not exist, by all its c
 	$(BIN)/python lab/scripts/rehearsal.py $(ARGS)
 
 pictures: demo debian  ## the pictures in docs/images that the demo shows (docs/pictures.md has the others; 10 minutes)
-	cp runs/demo/scenes/elastic-0007.png docs/images/demo.png
-	$(BIN)/tumortrack locate runs/demo/case runs/demo/dataset/elastic-0005/cloud.ply runs/pictures/run --depth-error 0 --overwrite
+	cp runs/demo/scenes/4-pressed-12-mm.png docs/images/demo.png
+	$(BIN)/tumortrack locate runs/demo/case runs/demo/dataset/1-rest/cloud.ply runs/pictures/run --depth-error 0 --overwrite
 	$(BIN)/tumortrack plan runs/pictures/run runs/pictures/plan --accept-budget --overwrite
 	cp runs/pictures/plan/plan.png docs/images/plan.png
 	rm -f docs/images/resection.gif  # a film replaces none

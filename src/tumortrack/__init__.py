@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from tumortrack.imaging.case import Case as Case
     from tumortrack.imaging.case import load_case as load_case
     from tumortrack.report.inspection import describe as describe
+    from tumortrack.simulate import datasets as datasets
     from tumortrack.tracking import presets as presets
     from tumortrack.tracking.tracker import Tracker as Tracker
 
@@ -44,6 +45,7 @@ _NAMES = {  # by the module that has them
     "report.inspection": "describe",
     "assessment.advice": "advise",
     "tracking.tracker": "Tracker",
+    "simulate": "datasets",
     "tracking": "presets",
 }
 _HOMES = {name: home for home, names in _NAMES.items() for name in names.split()}
@@ -56,7 +58,7 @@ def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     home = f"{__name__}.{_HOMES[name]}"
-    if name in ("errors", "presets"):
+    if name in ("datasets", "errors", "presets"):
         return import_module(f"{home}.{name}")
     return getattr(import_module(home), name)
 

@@ -189,7 +189,6 @@ def write_scenes(
     case: StrPath,
     folder: StrPath,
     *,
-    prefix: str = "",
     progress: Callable[[], None] | None = None,
     **options: Any,
 ) -> None:
@@ -198,7 +197,7 @@ def write_scenes(
 
     Args:
         case: folder that ``prepare`` wrote.
-        folder: where to write scene folders PREFIX0000, PREFIX0001, ...
+        folder: where to write scene folders 0000, 0001, ...
         progress: called after each scene.
         options: as on the command line: ``scenes``, ``seed``, ``configuration``, ``falloff``,
             ``rotations``, ``squeeze``, ``noise``, ``sensor``, ``uncalibrated``, ``tissue``,
@@ -219,7 +218,7 @@ def write_scenes(
             "another folder, or an empty one."
         )
     config = asked.scene_config().seen_whole(made_of.anatomy)
-    folders = [Path(folder) / f"{prefix}{index:04d}" for index in range(asked.scenes)]
+    folders = [Path(folder) / f"{index:04d}" for index in range(asked.scenes)]
     for _ in dataset.write_scenes(made_of, config, asked.seed, folders):
         if progress is not None:
             progress()
@@ -524,7 +523,7 @@ def evaluate(
 
     Args:
         locate: a tracker, the folder of a case or model, or any function from an observed cloud to
-            an estimate.
+            an estimate; it gets ``evidence=`` of scenes that have some.
         scenes: folder of scene folders, or scenes.
         report: folder for report.json, index.html and pictures (scenes of a folder only).
         overwrite: replace an earlier report there.

@@ -220,7 +220,7 @@ def test_train_wants_one_end(tmp_path):
 
 @pytest.mark.parametrize(
     ("minutes", "scenes", "words"),
-    [(-1.0, 2, "--minutes"), (np.nan, 2, "--minutes"), (1.0, 0, "--scenes")],
+    [(-1.0, 2, "--minutes"), (np.nan, 2, "--minutes"), (1.0, 0, "--scenes"), (1.0, 11, "--scenes")],
 )
 def test_a_demo_of_nothing_is_refused_at_once(minutes, scenes, words, tmp_path):
     with pytest.raises(InputError, match=words):

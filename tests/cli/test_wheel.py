@@ -94,7 +94,9 @@ def test_the_wheel_holds_the_package_alone(wheel):
     assert re.search(
         r"-py3-none-linux_\w+\.whl", wheel.name
     )  # for any Python, this kind of machine
-    assert not any(name.endswith(".safetensors") for name in names)  # nothing is learnt
+    (scenes,) = (name for name in names if name.endswith(".safetensors"))  # nothing is learnt
+    assert scenes == "tumortrack/simulate/phantom_scenes.safetensors"
+    assert zipfile.ZipFile(wheel).getinfo(scenes).compress_size < 5_000_000
     assert any(name.endswith("LICENSE") for name in names)
 
 

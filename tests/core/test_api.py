@@ -37,13 +37,13 @@ SIGNATURES = {
     "train": "case folder preset='clinic' config=None rotations=None sensor=None minutes=None "
     "steps=None seed=0 device='auto' workers=None checkpoint_every_s=30.0 report=None "
     "progress=None",
-    "write_scenes": "case folder prefix='' progress=None options",
+    "write_scenes": "case folder progress=None options",
 }
 VALUES = {
     "Case", "DepthFrame", "Estimate", "Free", "Held", "Intrinsics", "Landmark", "Look", "Outline",
     "SensorCloud", "Touch", "Tracker",
 }  # fmt: skip
-MODULES = {"errors", "presets"}
+MODULES = {"datasets", "errors", "presets"}
 
 
 def test_the_public_names_and_their_parameters():

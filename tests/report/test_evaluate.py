@@ -44,7 +44,7 @@ from tumortrack.report.pictures import (
 from tumortrack.report.place import check_place
 from tumortrack.report.protocol import Asked, evaluate_model, evaluate_scenes, failure
 from tumortrack.report.renderer import Body, Frame, ParallelView, rgb
-from tumortrack.report.summary import headlines, scene_lines, summarise, summary_tables
+from tumortrack.report.summary import conclusions, headlines, summarise, summary_tables
 from tumortrack.simulate.scene_folder import Scene
 
 
@@ -220,8 +220,10 @@ def test_an_answer_that_is_far_off_has_failed_however_it_is_called(tmp_path):
     assert "2 with a tumor's centre over 5 mm off (1 of them called good)" in first
     assert "worst 5.1 mm (tumor 1 of far)" in good  # never mixed with the poor ones
     assert "worst 30.0 mm (tumor 1 of poor)" in poor
-    assert scene_lines(report["scenes"]) == [
-        "far: good: far off: the centre of tumor_1 by 5.1 mm",
+    assert conclusions(report["scenes"]) == [
+        "of 3: 1 good and right (every tumor within 5 mm), 1 called good and WRONG, 0 poor though "
+        "right, 1 poor and wrong, 0 without an answer",
+        "far: called good and WRONG: far off: the centre of tumor_1 by 5.1 mm; no check failed",
         "poor: poor: it was not judged; far off: the centre of tumor_1 by 30.0 mm",
     ]
     assert failure({"kidney": {"found": True, "center_mm": 5.1}}).endswith("kidney by 5.1 mm")

@@ -114,15 +114,12 @@ class Simulate(SimulateOptions):
     dataset: Positional[Path]
 
     def run(self) -> None:
-        self.write()
-        say(f"{self.scenes} scenes written to {self.dataset}.")
-
-    def write(self, prefix: str = "") -> None:
         from tumortrack import api
 
         options = options_of(self, SimulateOptions)
         with progress_bar("simulate", self.scenes) as advance:
-            api.write_scenes(self.case, self.dataset, prefix=prefix, progress=advance, **options)
+            api.write_scenes(self.case, self.dataset, progress=advance, **options)
+        say(f"{self.scenes} scenes written to {self.dataset}.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,7 +149,17 @@ class Evaluate:
 
         check_grid(self.grid)
         check_place(self.report, self.overwrite)
-        self.write()
+        result = self.write()
+
+        from tumortrack.report.summary import conclusions, headlines, summary_tables
+
+        for table in summary_tables(result):
+            console.print(table)
+        for line in (*conclusions(result["scenes"]), *headlines(result["summary"])):
+            say(line)
+        if missing := result["rivals"].get("not_available"):
+            say(missing)
+        say(f"written to {self.report / 'report.json'}; look at {self.report / 'index.html'}.")
 
     def write(self) -> dict[str, Any]:
         """Write the report, replacing an earlier one; returns it."""
@@ -166,21 +173,11 @@ class Evaluate:
         say(str(patient))
 
         from tumortrack.report.protocol import Asked, evaluate_model
-        from tumortrack.report.summary import headlines, scene_lines, summary_tables
 
         keep_loaded()
-        out = self.report
         with progress_bar("evaluate", count, then="draw") as advance:
             asked = Asked(self.grid, self.seed, self.device, _PROCESSES)
-            result = evaluate_model(folder, self.variants, out, asked, advance, advance)
-        for table in summary_tables(result):
-            console.print(table)
-        for line in (*scene_lines(result["scenes"]), *headlines(result["summary"])):
-            say(line)
-        if missing := result["rivals"].get("not_available"):
-            say(missing)
-        say(f"written to {out / 'report.json'}; look at {out / 'index.html'}.")
-        return result
+            return evaluate_model(folder, self.variants, self.report, asked, advance, advance)
 
 
 @dataclass(frozen=True, kw_only=True)

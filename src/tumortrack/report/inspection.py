@@ -63,10 +63,10 @@ def _words(content: Content, sentences: Iterable[str | list[str]]) -> Iterator[s
 
 
 def _evaluation(report: Content) -> list[str]:
-    from tumortrack.report.summary import headlines, scene_lines
+    from tumortrack.report.summary import conclusions, headlines
 
     try:
-        lines = [*headlines(dict(report["summary"])), *scene_lines(report["scenes"])]
+        lines = [*headlines(dict(report["summary"])), *conclusions(report["scenes"])]
     except (KeyError, TypeError, AttributeError):
         return [
             "an evaluation report",

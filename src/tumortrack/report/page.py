@@ -28,11 +28,13 @@ from tumortrack.report.summary import (
     RIVALS,
     SAID,
     VERDICTS,
+    conclusions,
     error_rows,
     failures,
     measures,
     number,
     part_rows,
+    rival_center,
     scene_note,
     verdict_counts,
     words,
@@ -89,6 +91,7 @@ def write_page(report: dict[str, Any], scenes: list[dict[str, Any]], path: Path)
         "ERRORS": _error_table(summary),
         "RIVALS": _rivals(report),
         "TABLE": _scene_table(entries),
+        "CONCLUSIONS": "".join(f"<li>{html.escape(line)}</li>" for line in conclusions(entries)),
         "SUMMARY": _part_table(part_rows(summary)),
         "RULE": html.escape(report["rule"]),
         "VERDICT_COLOURS": " ".join(
@@ -155,7 +158,8 @@ def _base64(content: bytes) -> str:
 def _about(entry: dict[str, Any]) -> dict[str, Any]:
     """A scene's name, verdict, reason, and errors in one line."""
     reason = f"{NO_CHECK_FAILED}; {UNVERIFIED}" if entry["quality"] == "good" else entry["reason"]
-    about = {"name": entry["name"], "verdict": entry["quality"], "reason": reason}
+    name = ": ".join(filter(None, (entry["name"], entry.get("words"))))
+    about = {"name": name, "verdict": entry["quality"], "reason": reason}
     return {**about, "note": scene_note(entry)}
 
 
@@ -209,19 +213,21 @@ def _error_table(summary: dict[str, Any]) -> str:
 
 
 def _scene_table(entries: list[dict[str, Any]]) -> str:
-    head = ["scene", "verdict", "reason", "tumor or organ farthest off", "centre off, mm"]
+    described = any("words" in entry for entry in entries)
+    head = ["scene", "verdict", *(["organ"] * described), "tumor or organ farthest off"]
+    head.append("centre off, mm")
     head += [f"{name}: centre off, mm" for name in RIVALS.values()]
     head += ["targets: mean, mm", "largest, mm"]
     rows = []
     for entry in entries:
         far_mm, part = worst_center(entry)
-        rivals = [entry.get("rivals", {}).get(name, {}) for name in RIVALS]
-        centers = [row["parts"][part]["center_mm"] if "parts" in row else None for row in rivals]
+        centers = [rival_center(entry, name, part) for name in RIVALS]
         errors = entry.get("tre_mm") or {}
         far = [number(far_mm if np.isfinite(far_mm) else None, 1)]
         others = [number(mm, 1) if mm is not None else "-" for mm in centers]
         targets = [number(errors[key], 1) if errors else "-" for key in ("mean", "max")]
-        about = [entry["name"], entry["quality"], entry["reason"] or "-", words(part)]
+        done = [entry.get("words", "")] * described
+        about = [entry["name"], entry["quality"], *done, words(part)]
         rows.append([*about, *far, *others, *targets])
     return _table(head, rows)
 

@@ -23,7 +23,7 @@ from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.estimate import FAR_MM, Estimate
 from tumortrack.core.process import undisturbed
 from tumortrack.core.store import write_json, writing
-from tumortrack.core.types import Mesh, SensorCloud
+from tumortrack.core.types import Mesh
 from tumortrack.models.model import Model
 from tumortrack.report import metrics
 from tumortrack.report.place import clear
@@ -35,7 +35,7 @@ from tumortrack.tracking.options import model_folder
 from tumortrack.tracking.tracker import Tracker
 
 RULE = f"{SAID.medians} {SAID.rule.format(far_mm=FAR_MM)}"
-Locate = Callable[[SensorCloud], Estimate]
+Locate = Callable[..., Estimate]  # of a cloud; where a scene has some, of ``evidence=``, too
 Compare = Callable[[Scene], dict[str, Any]]
 Judge = Callable[[Path, Path], dict[str, Any]]
 Step = Callable[[], None]
@@ -183,7 +183,7 @@ def evaluate_scenes(
 
     Args:
         locate: observed cloud (camera frame, mm) -> estimate; raises NoEstimate or InputError if it
-            has none, which counts as a failed scene.
+            has none, which counts as a failed scene. Gets ``evidence=`` of scenes that have some.
         progress: called after each scene that was judged; drawn: after each picture.
         about: plain JSON for the report: the model and options behind ``locate``.
         rivals: rigid registration of a scene, see ``report.rivals.Rivals``.
@@ -203,6 +203,8 @@ def _judged(locate: Locate, rivals: Compare | None, aside: Path, folder: Path) -
     entry, estimate = evaluate_scene(locate, scene, folder.name, rivals)
     if isinstance(stated := scene.meta.get("registration"), dict):  # of a second CT
         entry["registration_mm"] = stated.get("tre_mm", {})
+    if isinstance(said := scene.meta.get("words"), str):
+        entry["words"] = said
     with writing(aside):
         _put_aside(aside / f"{folder.name}.npz", estimate.meshes if estimate else {})
     return entry
@@ -285,9 +287,9 @@ def evaluate_scene(
     With ``tre_mm`` if the scene has targets and the estimate a motion; null if the scene has
     targets and nothing was found.
     """
-    start = time.perf_counter()
+    start, known = time.perf_counter(), {"evidence": scene.evidence} if scene.evidence else {}
     try:
-        estimate = locate(scene.cloud)
+        estimate = locate(scene.cloud, **known)
     except (NoEstimate, InputError) as error:
         parts = {part: {"found": False, "iou": 0.0} for part in scene.reference.names}
         verdict = {"quality": "none", "reason": str(error), "failed": str(error)}

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from rich.table import Table
 
-from tumortrack.core.estimate import FAR_MM
+from tumortrack.core.estimate import FAR_MM, NO_CHECK_FAILED
 from tumortrack.core.organ import is_tumor
 from tumortrack.core.tables import read_table
 from tumortrack.report.metrics import SurfaceDistances
@@ -269,13 +269,52 @@ def part_rows(summary: dict[str, Any]) -> dict[str, dict[str, Any]]:
     return {k: row for k, row in summary.items() if isinstance(row, dict) and "found" in row}
 
 
-def scene_lines(entries: list[Entry]) -> list[str]:
-    """A line for each scene without a good answer, or with a good one that failed."""
-    lines = []
+def scene_table(entries: list[Entry]) -> Table:
+    """For the terminal: each scene, what was done to the organ, the verdict, and how far off the
+    farthest tumor is, by the estimate and by the rigid fit."""
+    table, nearer, both = Table(), 0, 0
+    for head in ("scene", "organ", "verdict"):
+        table.add_column(head, no_wrap=head != "organ")
+    for head in ("off", "rigid fit"):
+        table.add_column(head, justify="right", no_wrap=True)
     for entry in entries:
-        if entry["quality"] != "good" or entry["failed"]:
-            reasons = dict.fromkeys(r for r in (entry["reason"], entry["failed"]) if r)
-            lines.append(f"{entry['name']}: {entry['quality']}: {'; '.join(reasons)}")
+        far_mm, part = worst_center(entry)
+        rigid_mm = rival_center(entry, "rigid_fit", part)
+        mm = number(_finite(far_mm), 1), "-" if rigid_mm is None else number(rigid_mm, 1)
+        table.add_row(entry["name"], entry.get("words", ""), entry["quality"], *mm)
+        nearer, both = nearer + (far_mm < (rigid_mm or 0)), both + (rigid_mm is not None)
+    table.caption = (
+        "off: the middle of the tumor that is farthest off, mm; nearer than by the rigid fit in "
+        f"{nearer} of {both}"
+    )
+    return table
+
+
+def rival_center(entry: Entry, rival: str, part: str) -> float | None:
+    """How far off that rigid registration has the middle of a part, mm; None: it was not done."""
+    parts = entry.get("rivals", {}).get(rival, {}).get("parts", {})
+    return parts[part]["center_mm"] if part in parts else None
+
+
+def conclusions(entries: list[Entry]) -> list[str]:
+    """What was good, what was wrong and why: the counts, then a line for each scene without a good
+    answer, or with a good one that failed."""
+    right = [entry["quality"] for entry in entries if not entry["failed"]]
+    wrong = [entry["quality"] for entry in entries if entry["failed"]]
+    lines = [
+        f"of {len(entries)}: {right.count('good')} good and right (every tumor within {FAR_MM:g} "
+        f"mm), {wrong.count('good')} called good and WRONG, {right.count('poor')} poor though "
+        f"right, {wrong.count('poor')} poor and wrong, {wrong.count('none')} without an answer"
+    ]
+    for entry in entries:
+        if entry["quality"] == "good" and not entry["failed"]:
+            continue
+        if entry["quality"] == "good":
+            said, why = "called good and WRONG", [entry["failed"], NO_CHECK_FAILED]
+        else:
+            though = "" if entry["failed"] else f", though within {FAR_MM:g} mm"
+            said, why = f"{entry['quality']}{though}", [entry["reason"], entry["failed"]]
+        lines.append(f"{entry['name']}: {said}: {'; '.join(dict.fromkeys(filter(None, why)))}")
     return lines
 
 

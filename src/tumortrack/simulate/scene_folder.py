@@ -1,6 +1,6 @@
 """One scene on disk, measurement and truth, in files that other programs can make: cloud.ply,
-depth.png with intrinsics.json, kidney.ply (or of the organ's name), tumor_1.ply, ..., targets.csv
-and meta.json. docs/conventions.md defines them.
+depth.png with intrinsics.json, kidney.ply (or of the organ's name), tumor_1.ply, ..., targets.csv,
+evidence.json and meta.json. docs/conventions.md defines them.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from tumortrack.core import store
 from tumortrack.core.config import check_seed
 from tumortrack.core.csv_tables import read_rows
 from tumortrack.core.errors import InputError
+from tumortrack.core.evidence import Evidence, evidence_json, read_evidence
 from tumortrack.core.mesh_files import read_anatomy, write_anatomy
 from tumortrack.core.mesh_query import contains, labels_of
 from tumortrack.core.organ import KIDNEY, Organ, is_tumor, organ_entry, organ_in
@@ -28,7 +29,7 @@ from tumortrack.sense.ply import write_cloud_ply
 # Our own scenes state in meta.json that the organ's surface includes its tumors.
 _UNITED = "organ_includes_tumors"
 _STAMP = "stamp_ns"
-_TARGETS = "targets.csv"
+_TARGETS, _EVIDENCE = "targets.csv", "evidence.json"
 _LARGEST_TABLE = 64 * 2**20  # bytes
 _STICKS_OUT = 0.02  # share of a tumor's volume; smoothing alone makes less stick out
 _ORGAN_SIZE_MM = (5.0, 1000.0)
@@ -61,13 +62,15 @@ class InnerPoints:
 class Scene:
     """An observed cloud and the truth, camera frame, mm. ``reference.parts[0]`` is the whole organ,
     tumors included; ``depth`` the cloud's image, if known; ``meta`` plain JSON (recipe, origin,
-    ...); ``targets`` inner points with known positions in the CT."""
+    ...); ``targets`` inner points with known positions in the CT; ``evidence`` what is known beside
+    the cloud."""
 
     cloud: SensorCloud
     reference: Anatomy
     depth: DepthFrame | None = None
     meta: dict[str, Any] = field(default_factory=dict)
     targets: Targets | None = None
+    evidence: tuple[Evidence, ...] = ()
 
     def write(self, folder: str | Path) -> None:
         """Write a scene folder, all or nothing. Raises InputError: the folder exists already;
@@ -89,6 +92,8 @@ def write_scene_files(folder: Path, scene: Scene) -> None:
         numbers, head = ["%d", *["%.5f"] * 6], ",".join(_COLUMNS)  # to 0.01 micrometres
         np.savetxt(text, table, numbers, delimiter=",", header=head, comments="")
         store.write_atomically(folder / _TARGETS, text.getvalue().encode())
+    if scene.evidence:
+        store.write_atomically(folder / _EVIDENCE, evidence_json(scene.evidence))
     fixed = {"units": "mm", "frame": "camera", _STAMP: scene.cloud.stamp_ns, _UNITED: True}
     meta = {**scene.meta, **fixed, "organ": organ_entry(scene.reference.kind)}
     store.write_json(folder / "meta.json", meta)
@@ -126,7 +131,9 @@ def read_scene(folder: Path) -> Scene:
     points_mm = read_cloud(folder / "cloud.ply")[0].points_mm
     cloud = SensorCloud(points_mm, stamp_ns, depth_error=error)
     targets = read_targets(table) if table.exists() else None
-    return Scene(cloud, reference, frame, meta, targets)
+    file = folder / _EVIDENCE
+    evidence = read_evidence(file)[1] if file.exists() else ()
+    return Scene(cloud, reference, frame, meta, targets, evidence)
 
 
 def organ_of_folder(folder: Path, meta: dict[str, Any]) -> Organ:

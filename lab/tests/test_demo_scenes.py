@@ -1,0 +1,63 @@
+"""How the scenes that the package brings are made: by a rule that no answer enters."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tumortrack.core.errors import NoEstimate, TumortrackError
+from tumortrack.core.geometry import transform_points
+from tumortrack.imaging.case import load_case
+from tumortrack.simulate import datasets
+from tumortrack_lab.twin.apparatus import bench_from_ct
+from tumortrack_lab.twin.dataset import StateCache
+from tumortrack_lab.twin.views import EquilibriumState
+from tumortrack_lab.world import demo
+from tumortrack_lab.world.families import Deformed
+
+pytestmark = pytest.mark.slow
+
+
+def test_the_first_state_and_the_first_view_that_there_are(phantom_case, tmp_path, monkeypatch):
+    """All states at rest. The first seed has no equilibrium, the first view shows no organ."""
+    tried, views, find = [], [], demo.organ_cloud
+
+    def solve(organ, family, seed):
+        tried.append((family, seed))
+        if seed == 0:
+            raise TumortrackError("no equilibrium")
+        return Deformed(organ, organ.mesh.nodes_mm, organ.mesh.tets, 10.0, None, {})
+
+    def get(cache, name, say):
+        anatomy, points = demo.moved(case.anatomy, to_bench), inner.points_ct
+        return EquilibriumState(name, anatomy, transform_points(to_bench, points), to_bench, {})
+
+    def found(view, organ, rng):
+        views.append(view)
+        if len(views) == 1:
+            raise NoEstimate("not in the image")
+        return find(view, organ, rng)
+
+    case = load_case(phantom_case)
+    inner = demo.draw_targets(case.anatomy, 0)
+    to_bench = bench_from_ct(case.anatomy.organ, case.up_lps)
+    monkeypatch.setattr(demo, "solve", solve)
+    monkeypatch.setattr(demo, "organ_cloud", found)
+    monkeypatch.setattr(StateCache, "get", get)
+    scenes = demo.demo_scenes(phantom_case, tmp_path, lambda text: None)
+    assert list(scenes) == list(datasets.phantom_scenes())
+    assert tried == [(f, seed) for f in ("cut", "pull", "clamp") for seed in (0, 1)]
+    assert [scene.meta["attempt"] for scene in scenes.values()] == [1, *[0] * 9]
+    assert 0.2 < scenes["9-hidden"].meta["hidden_share"] < 0.8
+    for scene in scenes.values():
+        pose = np.array(scene.meta["camera_from_ct"])
+        carried = transform_points(pose, case.anatomy.organ.vertices_mm)
+        np.testing.assert_allclose(scene.reference.organ.vertices_mm, carried, atol=1e-6)
+    content = datasets.packed(scenes, case.anatomy)
+    (tmp_path / datasets.FILE).write_bytes(content)
+    monkeypatch.setattr(datasets.resources, "files", lambda _: tmp_path)
+    for name, kept in datasets.phantom_scenes().items():
+        for part, true in zip(kept.reference.parts, scenes[name].reference.parts, strict=True):
+            np.testing.assert_allclose(part.vertices_mm, true.vertices_mm, atol=0.00052)
+        np.testing.assert_allclose(kept.depth.depth_mm, scenes[name].depth.depth_mm, atol=1e-4)
+        assert kept.evidence == scenes[name].evidence
