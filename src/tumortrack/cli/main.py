@@ -92,8 +92,8 @@ def run(arguments: list[str]) -> int:
 
 
 def leave(code: int = 0) -> NoReturn:
-    """End the process at once, after everything is written: a regular exit takes a fifth of a
-    second more. Exit handlers are not called."""
+    """End the process at once, after everything is written: a regular exit takes a tenth of
+    `locate`'s time more. Exit handlers are not called."""
     if sys.stderr is not None:  # as after 2>&-
         sys.stderr.flush()
     os._exit(code)
@@ -118,8 +118,10 @@ def _commands(chosen: str) -> dict[str, Callable[..., Command]]:
     from importlib.metadata import entry_points
 
     others = sorted(entry_points(group="tumortrack.commands"), key=lambda point: point.name)
-    others = [point for point in others if point.name == chosen] or others
-    commands = {name: _ours(name) for name in _MODULES}
+    if alone := [point for point in others if point.name == chosen]:
+        commands, others = {}, alone
+    else:
+        commands = {name: _ours(name) for name in _MODULES}
     for point in others:
         try:
             commands[point.name] = point.load()

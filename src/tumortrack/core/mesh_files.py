@@ -1,9 +1,11 @@
-"""Mesh files. PLY is written by own code, as trimesh, which does the rest, is slow to import."""
+"""Mesh files. PLY is written and read again by own code, as trimesh, which does the rest, is slow
+to import."""
 
 from __future__ import annotations
 
 import io
 import logging
+import re
 from pathlib import Path
 
 import numpy as np
@@ -17,22 +19,16 @@ SUFFIXES = (".ply", ".stl", ".obj")
 _LARGEST_FILE = 512 * 2**20  # bytes
 _SILENT = logging.NullHandler()  # trimesh logs tracebacks of normals and textures that it skips
 _SPACE, _STL_HEADER = b"SPACE=LPS", 80
+_FACE = np.dtype([("corners", "u1"), ("indices", "<i4", 3)])  # in a PLY of ours
 
 
 def read_mesh(path: Path) -> Mesh:
     """Read one triangle mesh (PLY, STL or OBJ) with equal vertices merged. Raises InputError:
     missing, too large, not a mesh, no triangles."""
-    import trimesh
-
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: unknown mesh type. Allowed: {', '.join(SUFFIXES)}.")
     content = read_file(path, _LARGEST_FILE, "Reduce the mesh first.")
-    logging.getLogger("trimesh").addHandler(_SILENT)
-    with readable(path, "cannot be read as a mesh"):
-        loaded = trimesh.load_mesh(  # from memory, so that no texture that it names is opened
-            io.BytesIO(content), path.suffix.lower()[1:], process=False, skip_materials=True
-        )
-        vertices, faces = np.asarray(loaded.vertices), np.asarray(loaded.faces)
+    vertices, faces = _own_ply(content) or _by_trimesh(content, path)
     if faces.ndim != 2 or len(faces) == 0 or len(vertices) == 0:
         raise InputError(f"{path} holds no triangles (an empty or damaged file).")
     if faces.min() < 0 or faces.max() >= len(vertices):
@@ -47,6 +43,30 @@ def read_mesh(path: Path) -> Mesh:
     return Mesh(unique, faces[proper])
 
 
+def _own_ply(content: bytes) -> tuple[np.ndarray, np.ndarray] | None:
+    """Vertices and faces of what ``_ply`` wrote; None: something else."""
+    counts = list(map(int, re.findall(rb"\nelement [a-z]+ (\d{1,9})\n", content[:400])))
+    if len(counts) != 2 or not content.startswith(header := _ply_header(*counts)):
+        return None
+    start, end = len(header), len(header) + 12 * counts[0]
+    if len(content) != end + _FACE.itemsize * counts[1]:
+        return None
+    vertices = np.frombuffer(content[start:end], "<f4").reshape(-1, 3)
+    faces = np.frombuffer(content[end:], _FACE)
+    return (vertices.astype(float), faces["indices"]) if (faces["corners"] == 3).all() else None
+
+
+def _by_trimesh(content: bytes, path: Path) -> tuple[np.ndarray, np.ndarray]:
+    import trimesh
+
+    logging.getLogger("trimesh").addHandler(_SILENT)
+    with readable(path, "cannot be read as a mesh"):
+        loaded = trimesh.load_mesh(  # from memory, so that no texture that it names is opened
+            io.BytesIO(content), path.suffix.lower()[1:], process=False, skip_materials=True
+        )
+        return np.asarray(loaded.vertices), np.asarray(loaded.faces)
+
+
 def write_mesh(path: Path, mesh: Mesh) -> None:
     """Write a binary PLY or STL, by suffix, in mm. The header states ``SPACE=LPS`` for 3D Slicer,
     also for meshes in the camera frame, which Slicer shows as if it were the patient's. Raises
@@ -56,17 +76,21 @@ def write_mesh(path: Path, mesh: Mesh) -> None:
         path.write_bytes(content)
 
 
-def _ply(mesh: Mesh) -> bytes:
+def _ply_header(vertices: int, faces: int) -> bytes:
     """Turk 1994, "The PLY Polygon File Format"."""
     header = (
         f"ply\nformat binary_little_endian 1.0\ncomment {_SPACE.decode()}\n"
-        f"element vertex {len(mesh.vertices_mm)}\n"
-        "property float x\nproperty float y\nproperty float z\n"
-        f"element face {len(mesh.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+        f"element vertex {vertices}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {faces}\nproperty list uchar int vertex_indices\nend_header\n"
     )
-    faces = np.empty(len(mesh.faces), [("corners", "u1"), ("indices", "<i4", 3)])
+    return header.encode()
+
+
+def _ply(mesh: Mesh) -> bytes:
+    faces = np.empty(len(mesh.faces), _FACE)
     faces["corners"], faces["indices"] = 3, mesh.faces
-    return header.encode() + mesh.vertices_mm.astype("<f4").tobytes() + faces.tobytes()
+    vertices = mesh.vertices_mm.astype("<f4")
+    return _ply_header(len(vertices), len(faces)) + vertices.tobytes() + faces.tobytes()
 
 
 def _stl(mesh: Mesh) -> bytes:

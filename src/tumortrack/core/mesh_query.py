@@ -14,6 +14,7 @@ from tumortrack.core.types import Anatomy, Mesh
 _WITHIN_MM = 0.1  # of ``surface_distance``
 _CELLS = 32  # of a margin's lattice along the longest side
 _FINEST_MM, _COARSEST_MM = 0.6, 1.5
+_FAR_STEPS = 3.5  # two diagonals of a cell: from a third node, and to a cell's other corners
 # Vertices are sampled too, so the maximum misses at most s^2 / (8 R) where a flat piece of size s
 # lies over a surface of radius R: 0.025 mm at R = 5 mm.
 SPACING_MM = 1.0
@@ -103,10 +104,19 @@ def exact_margin(part: Mesh, margin_mm: float) -> Mesh:
     size = float((upper - lower).max()) + 2 * margin_mm
     step = float(np.clip(size / _CELLS, _FINEST_MM, _COARSEST_MM))
     origin = lower - margin_mm - 2 * step
-    shape = np.ceil((upper - lower + 2 * margin_mm) / step).astype(int) + 5
-    nodes = origin + step * np.indices(shape).reshape(3, -1).T
-    away = np.linalg.norm(nearest_places(part, nodes) - nodes, axis=1)
-    distance = _signed(part, nodes, away).reshape(shape)
+    shape = 3 * np.ceil(((upper - lower + 2 * margin_mm) / step + 5) / 3).astype(int)
+    nodes = np.moveaxis(origin[:, None, None, None] + step * np.indices(shape), 0, -1)
+
+    def signed(nodes: np.ndarray) -> np.ndarray:
+        return _signed(part, nodes, np.linalg.norm(nearest_places(part, nodes) - nodes, axis=1))
+
+    # Every third node's distance, and the exact one where the surface may be: between neighbours it
+    # differs by a step at most.
+    distance = signed(nodes[1::3, 1::3, 1::3].reshape(-1, 3)).reshape(shape // 3)
+    for axis in range(3):
+        distance = distance.repeat(3, axis)
+    near = np.abs(distance - margin_mm) < _FAR_STEPS * step
+    distance[near] = signed(nodes[near])
     vertices, faces, _, _ = marching_cubes(distance, margin_mm, gradient_direction="descent")
     return Mesh(origin + step * vertices, faces)
 

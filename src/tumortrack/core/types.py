@@ -25,8 +25,8 @@ OUTSIDE, ORGAN, FIRST_TUMOR = 0, 1, 2
 def _freeze(value: object, name: str, dtype: npt.DTypeLike, shape: tuple[int | None, ...]) -> None:
     """Convert a field to a read-only array and check its shape (None: any length)."""
     given, field = np.asarray(getattr(value, name)), f"{type(value).__name__}.{name}"
-    if given.dtype == dtype and given.flags.owndata and not given.flags.writeable:
-        array = given  # already frozen by another value
+    if given.dtype == dtype and not given.flags.writeable and _is_alone(given):
+        array = given  # already frozen by another value, or bytes of a file
     else:
         array = given.astype(dtype)  # a copy, so that the caller's stays writable
     if array.dtype.kind in "iu" and array.dtype != given.dtype and (array != given).any():
@@ -40,6 +40,14 @@ def _freeze(value: object, name: str, dtype: npt.DTypeLike, shape: tuple[int | N
         raise InputError(f"{field} has shape {array.shape}; it must be {wanted}.")
     array.flags.writeable = False
     object.__setattr__(value, name, array)
+
+
+def _is_alone(array: np.ndarray) -> bool:
+    """Whether a read-only array shows what no other one can write."""
+    base = array.base
+    while isinstance(base, np.ndarray):
+        base = base.base
+    return array.flags.owndata or isinstance(base, bytes)
 
 
 def _freeze_grid(value: object, values: str, dtype: npt.DTypeLike, name: str) -> None:

@@ -33,7 +33,7 @@ _SAVE_AS = {  # of formats that no reader here knows
     (".mha", ".mhd", ".mgz", ".mgh", ".mnc", ".npy", ".npz", ".vti", ".tif"): ".nii.gz or .nrrd",
     (".vtk", ".vtp", ".vtu", ".glb", ".gltf", ".3mf", ".off"): "STL, OBJ or PLY",
 }
-_CHUNK = 2**16  # labels that are counted at once
+CHUNK = 2**16  # labels at once: they stay in the cache
 
 
 class Segment(NamedTuple):
@@ -159,8 +159,8 @@ def label_counts(labels: UInt8[np.ndarray, "i j k"]) -> Int64[np.ndarray, " 256"
     """How many voxels have each label."""
     flat = labels.ravel(order="K")
     counts = np.zeros(256, np.int64)
-    for start in range(0, len(flat), _CHUNK):
-        chunk = flat[start : start + _CHUNK]
+    for start in range(0, len(flat), CHUNK):
+        chunk = flat[start : start + CHUNK]
         inside = chunk[chunk > 0]  # few, and bincount makes eight bytes of each
         counts += np.bincount(inside, minlength=256)
         counts[0] += len(chunk) - len(inside)

@@ -32,7 +32,7 @@ from tumortrack.imaging.hu_windows import segment_ct
 from tumortrack.imaging.meshes import LEAST_DROPPED_ML, label_meshes, read_meshes
 from tumortrack.imaging.options import PrepareOptions, parse_structures
 from tumortrack.imaging.segments import Parts, is_tumor, other_organ, parts_of
-from tumortrack.imaging.select import neighbours, select_labels
+from tumortrack.imaging.select import among, neighbours, select_labels
 from tumortrack.imaging.structures import extent_report, read_structures, split_structures
 from tumortrack.imaging.surface import surfaces
 from tumortrack.imaging.symmetry import ambiguous, half_turns, warning
@@ -236,8 +236,9 @@ def _selected(
             f"{path} is of a {other} by its name. Give --name {other}, or --organ NUMBER of the "
             f"{options.kind.words}."
         )
-    used = organ, *(np.arange(FIRST_TUMOR, 256) if tumors is None else tumors)
-    _check_every_slice(np.isin(volume.labels, used), volume.lps_from_index, path)
+    present = np.flatnonzero(counts).tolist()
+    used = organ, *([n for n in present if n >= FIRST_TUMOR] if tumors is None else tumors)
+    _check_every_slice(among(volume.labels, used), volume.lps_from_index, path)
     source, structures = split_structures(volume, parts.structures, organ)
     selection = options.stated_side, organ, tumors, options.min_tumor_ml, options.kind
     chosen, notes, side = select_labels(source, *selection)

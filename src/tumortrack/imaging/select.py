@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -53,7 +54,7 @@ class _Pieces:
         return self.organ_ml + self.tumor_ml
 
     def _ml(self, values: tuple[int, ...]) -> np.ndarray:
-        inside = self.numbers[_among(self.labels, values)]
+        inside = self.numbers[among(self.labels, values)]
         count = np.bincount(inside, minlength=int(self.numbers.max()) + 1)
         return count * grid.voxel_ml(self.lps_from_index)
 
@@ -86,7 +87,7 @@ def select_labels(
     present = [int(n) for n in np.flatnonzero(grid.label_counts(labels)) if n > 0]
     tumors = _tumor_labels(present, organ, tumors)
     middle = affine @ [*(np.array(labels.shape) / 2), 1]
-    counted = _among(labels, (organ, *tumors))
+    counted = among(labels, (organ, *tumors))
     _check_border(counted)
     box = grid.bounding_box(counted, affine, 2.0)
     affine = grid.moved_origin(affine, box)
@@ -114,18 +115,22 @@ def select_labels(
     return grid.cropped(out, grid.moved_origin(affine, box)), notes + more, side
 
 
-def _among(labels: np.ndarray, values: tuple[int, ...]) -> np.ndarray:
-    """``np.isin``, ten times as fast."""
+def among(labels: np.ndarray, values: Sequence[int]) -> np.ndarray:
+    """``np.isin``, ten times as fast for few values."""
     mask = np.zeros_like(labels, bool)
-    for value in values:
-        mask |= labels == value
+    flat, out = labels.ravel(order="K"), mask.ravel(order="K")
+    for start in range(0, len(flat), grid.CHUNK):
+        part = slice(start, start + grid.CHUNK)
+        for value in values:
+            out[part] |= flat[part] == value
     return mask
 
 
 def _check_border(counted: np.ndarray) -> None:
     """Refuse a map with much of its border labelled, which cuts off the organ's surface."""
     inner = counted[1:-1, 1:-1, 1:-1]
-    share = (counted.sum() - inner.sum()) / max(counted.size - inner.size, 1)
+    border = np.count_nonzero(counted) - np.count_nonzero(inner)
+    share = border / max(counted.size - inner.size, 1)
     if share > _MOST_OF_BORDER:
         raise InputError(f"{share:.0%} of the map's border is labelled. Give it a wider margin.")
 
@@ -331,7 +336,7 @@ def neighbours(
     by label, the share of its surface that lies on what is used. A tumor inside has 1."""
     near = ndimage.binary_dilation(chosen > 0)
     touching = set(np.unique(labels[near]).tolist()) - {0, *used}
-    beside = ndimage.binary_dilation(_among(labels, used) & (chosen > 0))
+    beside = ndimage.binary_dilation(among(labels, used) & (chosen > 0))
     shares = {}
     for label in touching:
         mask = labels == label

@@ -37,24 +37,24 @@ def split_structures(
     """The labels without the structures, and the structures as surfaces, LPS mm. Where a structure
     lies in the organ, or in a bay up to 10 mm wide, its voxels become organ. Raises InputError: no
     such label, or the organ's own."""
+    numbers = {name: number for name, number in sources.items() if not isinstance(number, Path)}
+    if not numbers:  # without a copy of a large map
+        return volume, {}
     labels, affine, meshes = volume.labels.copy(), volume.lps_from_index, {}
     removed = np.zeros(labels.shape, bool)
-    for name, number in sources.items():
-        if isinstance(number, Path):
-            continue
+    for name, number in numbers.items():
         mask = volume.labels == number
         if number == organ or not mask.any():
             present = np.unique(volume.labels).tolist()
             raise InputError(f"--structure {name}={number}: the map's labels are {present}.")
         meshes[name] = surface_of(name, mask, affine, _STEP_MM, keep=lambda mesh: mesh)
         removed |= mask
-    if meshes:
-        labels[removed] = 0
-        spacing, box = spacing_mm(affine), bounding_box(labels == organ, affine, 3 * _BAY_MM)
-        outside = labels[box] != organ
-        grown = distance_transform_edt(outside, sampling=spacing) <= _BAY_MM
-        closed = distance_transform_edt(grown, sampling=spacing) > _BAY_MM
-        labels[box][closed & removed[box]] = organ
+    labels[removed] = 0
+    spacing, box = spacing_mm(affine), bounding_box(labels == organ, affine, 3 * _BAY_MM)
+    outside = labels[box] != organ
+    grown = distance_transform_edt(outside, sampling=spacing) <= _BAY_MM
+    closed = distance_transform_edt(grown, sampling=spacing) > _BAY_MM
+    labels[box][closed & removed[box]] = organ
     return LabelVolume(labels, affine), meshes
 
 
@@ -81,6 +81,8 @@ def extent_report(
 ) -> tuple[dict[str, Any], list[str]]:
     """How far each structure extends outside the organ (JSON types), and notes on those whose
     motion is extrapolated. Raises InputError: one lies apart from the organ."""
+    if not meshes:
+        return {}, []
     report, notes, tree = {}, [], cKDTree(anatomy.organ.spread_mm())
     index_from_lps = np.linalg.inv(labels.lps_from_index)
     for name, mesh in meshes.items():

@@ -109,6 +109,8 @@ def labels_of(raw: grid.RawVolume, path: Path) -> LabelVolume:
 def _whole(array: np.ndarray) -> UInt8[np.ndarray, "i j k"] | None:
     """Numbers as labels, to which they must be as close as rounding leaves them; None: they are
     not."""
+    if array.dtype == np.uint8:
+        return array
     if not (array.min() >= -_OFF_WHOLE and array.max() <= 255 + _OFF_WHOLE):
         return None
     if array.dtype.kind != "f":

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.csv_tables import number_in, text_of
@@ -122,6 +121,8 @@ def _easy_handeye(path: Path) -> dict[str, Any]:
     if not abs(np.linalg.norm(turn) - 1) < _NOT_UNIT:
         raise InputError(f"{path}: {', '.join(_TURN)} must have length 1.")
     moves = on_hand.lower() in ("true", "eye_in_hand", "eye_on_hand")
+    from scipy.spatial.transform import Rotation  # slow to import
+
     pose = rigid(Rotation.from_quat(turn).as_matrix(), np.array(metres)).tolist()
     frames = {"frame_id": found[needed[-2]], "camera_frame_id": found[needed[-1]]}
     return {"unit": "m", _TOOL if moves else "robot_from_camera": pose, **frames}

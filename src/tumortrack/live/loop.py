@@ -140,6 +140,8 @@ class Loop:
         if not isinstance(source, Cameras):
             source = Cameras([source], [self._context.published_frame.published_from_camera])
         self._cameras = source
+        import scipy.spatial  # noqa: F401 - slow: while sources open, before a poor frame needs it
+
         try:
             for result in self._results(source):
                 on_result(self._publish(result, sink_workers))

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from tumortrack.core.config import Config
 from tumortrack.core.csv_tables import read_rows, whole_in
@@ -100,6 +99,8 @@ class PoseBuffer:
         if (gap_ns := after_ns - before_ns) > _GAP_NS:
             values = {"seconds": float(gap_ns * 1e-9), "allowed_s": _GAP_NS * 1e-9}
             raise NoEstimate(Finding("pose_gap", values))
+        from scipy.spatial.transform import Rotation, Slerp  # slow to import
+
         share = (stamp_ns - before_ns) / gap_ns
         turns = Slerp([0, 1], Rotation.from_matrix([a[:3, :3], b[:3, :3]]))([share])
         return rigid(turns.as_matrix()[0], (1 - share) * a[:3, 3] + share * b[:3, 3])
@@ -138,6 +139,8 @@ class FilePoses(CameraPoses):
         if wrong := [what for what, met in faults.items() if not met]:
             raise InputError(f"{path} is not a table of poses: {wrong[0]}.")
         (self.frame_id,), self.poses = frames, PoseBuffer()
+        from scipy.spatial.transform import Rotation
+
         turns = Rotation.from_quat(numbers[:, 3:], scalar_first=True).as_matrix()
         for stamp_ns, turn, shift in zip(stamps_ns.tolist(), turns, numbers[:, :3], strict=True):
             self.poses.add(stamp_ns, rigid(turn, shift), len(stamps_ns))
@@ -150,6 +153,8 @@ class FilePoses(CameraPoses):
 
 def pose_row(stamp_ns: int, frame_id: str, pose: Affine) -> str:
     """A line of a table of poses."""
+    from scipy.spatial.transform import Rotation
+
     turn = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
     numbers = [*pose[:3, 3].tolist(), *turn.tolist()]
     return ",".join([str(stamp_ns), frame_id, *(f"{number:.9f}" for number in numbers)]) + "\n"

@@ -8,7 +8,7 @@ is imported, so a broken package affects no other.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -59,21 +59,23 @@ class Registry(Generic[C]):
 
     def extensions(self) -> Iterator[Extension]:
         """The kinds of other packages; each class is imported."""
-        for entry in self._entry_points():
+        entries = self._entry_points()
+        for entry in entries:
             fault = ""
             try:
-                self.config(entry.name, f"{self.what} {entry.name!r}")
+                self.config(entry.name, f"{self.what} {entry.name!r}", entries)
                 if entry.name in self.built_in:
                     fault = f"{entry.name!r} is built in, and cannot be replaced"
             except InputError as error:
                 fault = str(error)
             yield Extension(self.what, entry.name, _package_of(entry), fault)
 
-    def config(self, kind: str, where: str) -> type[C]:
-        """The configuration class of a kind. Raises InputError, which begins with ``where``."""
+    def config(self, kind: str, where: str, entries: Sequence[EntryPoint] | None = None) -> type[C]:
+        """The configuration class of a kind, among ``entries`` (None: all that are installed, for
+        which every package is asked). Raises InputError, which begins with ``where``."""
         if kind in self.built_in:
             return EntryPoint(kind, self.built_in[kind], self.group).load()
-        entries = self._entry_points()
+        entries = self._entry_points() if entries is None else entries
         matches = [entry for entry in entries if entry.name == kind]
         if not matches and kind == "ros1":
             raise InputError(

@@ -7,6 +7,7 @@ which gives a library of states. See docs/method.md, section "The elastic body".
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -169,14 +170,17 @@ def build_body(
     rng = np.random.default_rng([seed, 0xE1A57])
     up = unit(np.asarray(up_lps, float))
     reduced = reduced_organ(anatomy_ct, up, config, rng)
-    states = random_states(reduced, up, config.bed_anywhere, rng, config.states)
+    with ThreadPoolExecutor(1) as pool:  # while states are drawn, which takes one core
+        compliance = pool.submit(
+            compliance_modes, reduced.solid, reduced.patches, _COMPLIANCE_MODES
+        )
+        states = random_states(reduced, up, config.bed_anywhere, rng, config.states)
     if len(states) < config.states:
         raise InputError(
             f"only {len(states)} of {2 * config.states} loads leave this organ at rest; its "
             "surface may be torn. Look at the case's pictures, and prepare it again."
         )
-    compliance = compliance_modes(reduced.solid, reduced.patches, _COMPLIANCE_MODES)
-    return body_of(reduced, np.array(states, np.float32), compliance)
+    return body_of(reduced, np.array(states, np.float32), compliance.result())
 
 
 def length_over_kidney(anatomy_ct: Anatomy) -> float:

@@ -26,6 +26,7 @@ from tumortrack.core.types import Anatomy, Mesh
 
 Points = Float[np.ndarray, "p 3"]
 VOID = 1e-2  # stiffness of the medium outside, relative to the organ's
+CONTRAST = 3.0  # of tumors for the compliance, the middle one of the library's responses
 _SUBCELLS = 3  # samples along each axis of a cell for its filled fraction
 _ANCHOR = 1e-6  # relative stiffness that holds the rigid motions, which no load here excites
 
@@ -169,9 +170,17 @@ class LatticeSolid:
         entries = (values.ravel(), (rows.ravel(), columns.ravel()))
         return coo_matrix(entries, (size, size)).tocsr()
 
+    @cached_property
+    def usual_factor(self) -> BlockCholesky:
+        """The factor for ``CONTRAST``, kept: responses and compliance ask for it."""
+        return self._factor(CONTRAST)
+
     def factor(self, contrast: float) -> BlockCholesky:
         """Factor of the stiffness with tumors ``contrast`` times as stiff as the organ; the rigid
         motions are held very softly."""
+        return self.usual_factor if contrast == CONTRAST else self._factor(contrast)
+
+    def _factor(self, contrast: float) -> BlockCholesky:
         stiffness = self.stiffness(np.maximum(self.organ, VOID) + (contrast - 1) * self.tumor)
         inertia = np.repeat(self.volume_mm3 / self.volume_mm3.max(), 3)
         held = stiffness + diags(_ANCHOR * stiffness.diagonal().max() * inertia)

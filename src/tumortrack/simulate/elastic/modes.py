@@ -20,11 +20,10 @@ from tumortrack.core.geometry import triangles_of, unit
 from tumortrack.core.mesh_kernels import farthest
 from tumortrack.core.process import parallel_map
 from tumortrack.core.types import Mesh
-from tumortrack.simulate.elastic.finite import LatticeSolid
+from tumortrack.simulate.elastic.finite import CONTRAST, LatticeSolid
 
 LEVER_MM = 50.0  # a rotation's unknown is the motion at this lever arm
 _FORCED = 150  # places of forces for the compliance; 80 leave nearly the same errors
-_CONTRAST = 3.0  # of tumors for the compliance, the middle one of the library's responses
 _FREE = 1e-4  # N/mm: keeps rigid motions solvable without contacts
 
 
@@ -108,8 +107,8 @@ def compliance_modes(
     spots = np.stack([patches.spot(place, radius_mm) * areas for place in points_mm[chosen[0]]], 1)
     forces = np.einsum("pn,de->pdne", spots / spots.sum(0), np.eye(3)).reshape(len(areas), 3, -1)
     rigid = _RigidMotions.of(solid)
-    factor = solid.factor(_CONTRAST)
-    responses = rigid.removed(factor.solve(rigid.balanced(_at_nodes(forces, solid, patches))))
+    balanced = rigid.balanced(_at_nodes(forces, solid, patches))
+    responses = rigid.removed(solid.factor(CONTRAST).solve(balanced))
     shares = np.sqrt(areas / areas.sum())[:, None, None]
     moved = (solid.at(points_mm, responses) * shares).reshape(3 * len(areas), -1)
     squares, mixes = np.linalg.eigh(moved.T @ moved)
