@@ -173,7 +173,7 @@ rehearsal: setup  ## the experiment on a bench that does not exist, by all its c
 	$(BIN)/python lab/scripts/rehearsal.py $(ARGS)
 
 pictures: demo debian  ## the pictures in docs/images that the demo shows (docs/pictures.md has the others; 10 minutes)
-	cp runs/demo/scenes/4-pressed-12-mm.png docs/images/demo.png
+	cp runs/demo/scenes/2-pressed-4-mm.png docs/images/demo.png
 	$(BIN)/tumortrack locate runs/demo/case runs/demo/dataset/1-rest/cloud.ply runs/pictures/run --depth-error 0 --overwrite
 	$(BIN)/tumortrack plan runs/pictures/run runs/pictures/plan --accept-budget --overwrite
 	cp runs/pictures/plan/plan.png docs/images/plan.png

@@ -16,7 +16,8 @@ import os
 
 if __name__ == "__main__":  # what imports it keeps its environment
     # Sums depend on the number of threads.
-    os.environ.update({f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")})
+    names = "OMP", "OPENBLAS", "MKL", "TUMORTRACK"
+    os.environ.update({f"{name}_NUM_THREADS": "1" for name in names})
     os.environ.update(COLUMNS="100", NO_COLOR="1", TERM="dumb", CUDA_VISIBLE_DEVICES="")
 
 import argparse

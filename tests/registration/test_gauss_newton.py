@@ -407,6 +407,5 @@ def test_frames_leave_no_memory_behind(slim_model, unchecked):
     # A leak shows in every stretch of twenty frames; what another thread holds for a moment, or
     # something loaded once, in twenty stretches at most.
     grown = np.subtract(sizes[60:], sizes[40:-20])
-    # Numba's own tables grow by some 60 bytes a call until they are large enough: 1 kB a frame.
     # One cloud a frame that stayed would be 240,000.
     assert np.quantile(grown, 0.25) < 60_000

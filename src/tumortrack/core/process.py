@@ -52,7 +52,7 @@ def parallel_for(body: Callable[[slice], object], count: int, chunk: int) -> Non
     """Call ``body`` on every chunk of ``range(count)``, on two threads if there are two cores.
     Chunks, and so sums over them, do not depend on the number of cores. The second thread helps
     only if ``body`` releases the GIL; if it starts too late, it is not waited for.
-    ``NUMBA_NUM_THREADS=1`` keeps all work on the calling thread."""
+    ``TUMORTRACK_NUM_THREADS=1`` keeps all work on the calling thread."""
     chunks = deque(slice(first, first + chunk) for first in range(0, count, chunk))
 
     def drain() -> None:
@@ -86,7 +86,7 @@ def _helper(process: int) -> ThreadPoolExecutor | None:
     """A second thread of this process (threads do not survive a fork), if there is a core."""
     from concurrent.futures import ThreadPoolExecutor
 
-    cores = min(available_cores(), int(os.environ.get("NUMBA_NUM_THREADS", "2")))
+    cores = min(available_cores(), int(os.environ.get("TUMORTRACK_NUM_THREADS", "2")))
     return ThreadPoolExecutor(1, "parallel") if cores > 1 else None
 
 

@@ -114,7 +114,7 @@ class Loop:
         self.statistics = RunStatistics()
 
     def warm(self) -> None:
-        """Run each step once: the first frame need not wait for imports and compilation."""
+        """Run each step once: the first frame need not wait for imports."""
         bump = np.full((240, 424), 180.0, np.float32)
         rows, columns = np.mgrid[:240, :424]
         middle = np.hypot(rows - 120, columns - 212) < 60

@@ -241,7 +241,7 @@ class Tracker:
             raise NotThisOrgan(error.finding or str(error), causes, advice) from error
 
     def warm(self) -> None:
-        """Load and compile what the first call of ``follow`` would otherwise wait for."""
+        """Load what the first call of ``follow`` would otherwise wait for."""
         self._locator.warm()
 
 

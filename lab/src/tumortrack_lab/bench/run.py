@@ -92,7 +92,7 @@ def rows_of(task: Task) -> Iterator[BenchRow]:
     """Run a task in a process. Raises TumortrackError: it failed; the message quotes its last
     line."""
     threads = str(task.threads)
-    limits = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), threads)
+    limits = {f"{name}_NUM_THREADS": threads for name in ("OMP", "MKL", "TUMORTRACK")}
     command = [*WORKER, threads, str(task.folder), "quick" * task.quick, *task.groups]
     with tempfile.TemporaryFile("w+") as stderr:  # a pipe that nobody reads may fill
         process = subprocess.Popen(
