@@ -133,6 +133,13 @@ def test_the_build_says_what_it_compiles_with_and_what_to_do_without(tmp_path):
         assert "ziglang" in said.stdout
 
 
+def test_a_compiler_that_is_not_there_ends_the_build_in_one_line():
+    said = build(CC="no-such-compiler")
+    assert said.returncode == 1
+    assert "no-such-compiler" in said.stderr
+    assert "Traceback" not in said.stderr
+
+
 def test_pip_and_make_build_with_the_same_ziglang():
     sys.path.insert(0, str(ROOT / "tools"))
     try:
