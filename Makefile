@@ -173,7 +173,7 @@ rehearsal: setup  ## the experiment on a bench that does not exist, by all its c
 	$(BIN)/python lab/scripts/rehearsal.py $(ARGS)
 
 pictures: demo debian  ## the pictures in docs/images that the demo shows (docs/pictures.md has the others; 10 minutes)
-	cp runs/demo/scenes/2-pressed-4-mm.png docs/images/demo.png
+	cp runs/demo/scenes/8-pulled.png docs/images/demo.png
 	$(BIN)/tumortrack locate runs/demo/case runs/demo/dataset/1-rest/cloud.ply runs/pictures/run --depth-error 0 --overwrite
 	$(BIN)/tumortrack plan runs/pictures/run runs/pictures/plan --accept-budget --overwrite
 	cp runs/pictures/plan/plan.png docs/images/plan.png
@@ -185,7 +185,7 @@ wheel: setup $(TOOLS)  ## build the wheels of tracker, devices, the paper's meth
 	rm -rf dist build/lib devices/build occupancy/build resection/build lab/build experiment/build  # modules that are gone would be packed from there
 	CC=".tools/bin/python -m ziglang cc" $(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist --config-settings portable=1 .
 	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist ./devices ./occupancy ./resection ./experiment ./lab
-	$(BIN)/python tools/build_backend.py  # for this machine again
+	rm -f $(NATIVE)/*.elf && $(MAKE) --no-print-directory $(KERNELS)  # for this machine again
 	.tools/bin/twine check --strict dist/*.whl
 	.tools/bin/auditwheel show dist/tumortrack-*.whl
 	$(BIN)/python tools/dependencies.py sbom dist/tumortrack-*.whl dist/tumortrack_devices-*.whl dist/tumortrack_occupancy-*.whl dist/tumortrack_resection-*.whl dist/tumortrack_experiment-*.whl dist/tumortrack_lab-*.whl

@@ -24,7 +24,6 @@ from tumortrack.simulate.scene_folder import Scene, Targets
 FILE = "phantom_scenes.safetensors"
 SPACING_MM = (0.6, 0.6, 0.8)  # of the CT, ``scan_phantom(folder, 1, SPACING_MM)``
 SCENES = 10
-_CALIBRATED = DepthError(1.0)  # mm; the noise model's bias of a whole image is 0.6 mm (deviation)
 _STEP_MM = 0.001  # of displacements: what is apart at rest stays apart
 
 
@@ -50,7 +49,8 @@ def phantom_scenes(count: int = SCENES) -> dict[str, Scene]:
 
 
 def _scene(entry: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Scene:
-    of, camera = entry["arrays"], Intrinsics(**{**entry["intrinsics"], "depth_error": _CALIBRATED})
+    error = DepthError(*entry["intrinsics"].pop("depth_error"))
+    of, camera = entry["arrays"], Intrinsics(**entry["intrinsics"], depth_error=error)
     at_rest_mm = transform_points(np.array(entry["meta"]["camera_from_ct"]), arrays["rest_ct"])
     places_mm = at_rest_mm + arrays[f"{of}/moved"] * _STEP_MM
     *parts, targets_mm = np.split(places_mm, np.cumsum(entry["counts"]))
@@ -59,7 +59,7 @@ def _scene(entry: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> Scene:
     depth[depth == 0] = np.nan
     evidence = from_builtins(entry["evidence"], EvidenceFile, FILE).evidence
     return Scene(
-        SensorCloud(arrays[f"{of}/cloud"], depth_error=_CALIBRATED),
+        SensorCloud(arrays[f"{of}/cloud"], depth_error=error),
         Anatomy(tuple(map(Mesh, parts, faces))),
         DepthFrame(depth, camera),
         entry["meta"],

@@ -21,6 +21,7 @@ from tumortrack.core.errors import NoEstimate, TumortrackError
 from tumortrack.core.geometry import transform_points, triangles_of, unit
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.case import load_case
+from tumortrack.sense.camera import with_depth_error
 from tumortrack.simulate.scene_folder import Scene, Targets, draw_targets
 from tumortrack_lab.study.document import make_folder
 from tumortrack_lab.twin.apparatus import STATES, moved
@@ -29,6 +30,7 @@ from tumortrack_lab.twin.equilibrium import Rod
 from tumortrack_lab.twin.occluders import rod_mesh
 from tumortrack_lab.world.evidence import EvidenceSource
 from tumortrack_lab.world.families import Deformed, solve
+from tumortrack_lab.world.noise import StereoConfig
 from tumortrack_lab.world.organ import Organ
 from tumortrack_lab.world.scenes import TETS, World, WorldConfig
 from tumortrack_lab.world.views import look, organ_cloud
@@ -140,7 +142,10 @@ def _views(shown: _Shown, shot: _Shot, number: int, bench_from_ct: np.ndarray) -
         }
         points_mm = transform_points(to_camera, shown.targets.points_mm)
         targets = replace(shown.targets, points_mm=points_mm)
-        yield Scene(cloud, moved(shown.truth, to_camera), view.frame, meta, targets)
+        depth_mm = float(np.median(cloud.points_mm[:, 2]))
+        error = StereoConfig().depth_error(view.frame.intrinsics, depth_mm)
+        cloud, frame = replace(cloud, depth_error=error), with_depth_error(view.frame, error)
+        yield Scene(cloud, moved(shown.truth, to_camera), frame, meta, targets)
 
 
 def _upward(scene: Scene) -> np.ndarray:

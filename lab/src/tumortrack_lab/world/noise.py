@@ -30,7 +30,7 @@ from jaxtyping import Float32, Float64
 from scipy.ndimage import gaussian_filter, map_coordinates, minimum_filter
 
 from tumortrack.core.config import Config
-from tumortrack.core.types import DepthFrame, Intrinsics
+from tumortrack.core.types import DepthError, DepthFrame, Intrinsics
 
 _MATCHED_PX = 848  # width of the images that are matched
 _FATTEN_MM = 5.0  # a step that a matching window sees as an edge
@@ -56,6 +56,13 @@ class StereoConfig(Config, frozen=True, kw_only=True):
     film_degrees: float = 6.0
     gloss_share: float = 0.75
     quantum_mm: float = 0.1
+
+    def depth_error(self, camera: Intrinsics, depth_mm: float) -> DepthError:
+        """What a calibration of such a camera leaves at a depth: as wide as ``bias_px`` and its
+        slow variation are there."""
+        bias_px = 1.25**0.5 * self.bias_px
+        focal_baseline = camera.fx * _MATCHED_PX / camera.width * self.baseline_mm
+        return DepthError(round(3**0.5 * bias_px * depth_mm**2 / focal_baseline, 1))
 
 
 class StereoCamera:
