@@ -45,17 +45,21 @@ def test_a_call_fills_what_it_is_given():
 )
 def test_arrays_that_are_not_as_declared_are_refused(which, wrong):
     arrays = given()
-    arrays[which] = wrong
-    with pytest.raises(TypeError, match="probabilities: "):
+    arrays[3][:] = -1
+    as_before, arrays[which] = arrays[3], wrong
+    with pytest.raises(TypeError):
         CHANCES(*arrays)
+    assert (as_before == -1).all()  # nothing native ran
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_values_that_are_not_finite_are_refused_where_they_are_not_declared(value):
     arrays = given()
     arrays[0][2] = value
-    with pytest.raises(ValueError, match="finite"):
+    arrays[3][:] = -1
+    with pytest.raises(ValueError):  # noqa: PT011 - of ours there is no other
         CHANCES(*arrays)
+    assert (arrays[3] == -1).all()
     as_it_is = kernel("probabilities", F32["n"].any_value, F64["s"], I32["n"], F32["n"].out)
     as_it_is(*arrays)  # and numbers whose squares are not finite are
     arrays[0][2] = 1e30
@@ -64,9 +68,9 @@ def test_values_that_are_not_finite_are_refused_where_they_are_not_declared(valu
 
 
 def test_a_wrong_number_of_arguments_and_a_wrong_declaration_are_refused():
-    with pytest.raises(ValueError, match="probabilities"):
+    with pytest.raises(ValueError):  # noqa: PT011
         CHANCES(*given()[:3])
-    with pytest.raises(ImportError, match="bytes declared"):
+    with pytest.raises(ImportError):
         kernel("probabilities", F32["n"], F64["s"], I32["n"])(*given()[:3])
     with pytest.raises(AttributeError):
         kernel("no_such_kernel", int)(1)
@@ -103,13 +107,13 @@ def test_a_library_for_another_processor_is_not_used(monkeypatch):
     monkeypatch.setattr(native, "_features", lambda: frozenset({"fpu"}))
     native.library.cache_clear()
     try:
-        with pytest.raises(ImportError, match="another processor"):
+        with pytest.raises(ImportError):
             native.library()
     finally:
         native.library.cache_clear()
     monkeypatch.setattr(native, "LIBRARIES", ROOT / "docs")
     try:
-        with pytest.raises(ImportError, match="not built"):
+        with pytest.raises(ImportError):
             native.library()
     finally:
         native.library.cache_clear()

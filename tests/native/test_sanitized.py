@@ -1,11 +1,17 @@
-"""The kernels' tests once more, on kernels in which every access to an array is checked."""
+"""The kernels' tests once more, on kernels in which every access to an array is checked; and
+kernels for older processors."""
 
+import ctypes
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from tumortrack import native
+from tumortrack.native import F32, F64, I32, kernel
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
@@ -43,3 +49,28 @@ def test_an_access_beyond_an_array_is_seen(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode != 0
     assert "AddressSanitizer" in done.stdout + done.stderr
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc's flags")
+def test_an_older_processor_gets_the_library_that_it_can_run(tmp_path, monkeypatch):
+    """As in wheels: one library for newer processors, one for all. They give the same bits."""
+    sys.path.insert(0, str(ROOT / "tools"))
+    import build_backend
+
+    arrays = np.linspace(0, 5, 999, dtype=np.float32), np.full(1, 0.7), np.zeros(999, np.int32)
+    answers = []
+    for name, target in (("kernels", "x86-64"), ("kernels_v3", "x86-64-v3")):
+        build_backend.build(["gcc"], tmp_path / f"{name}.elf", [f"-march={target}"])
+    monkeypatch.setattr(native, "LIBRARIES", tmp_path)
+    for features in (set(), native._features()):
+        monkeypatch.setattr(native, "_features", lambda features=features: frozenset(features))
+        native.library.cache_clear()
+        try:
+            needed = ctypes.c_char_p.in_dll(native.library(), "processor_features").value
+            chances = kernel("probabilities", F32["n"], F64["s"], I32["n"], F32["n"].out)
+            answers.append(np.empty(999, np.float32))
+            chances(*arrays, answers[-1])
+        finally:
+            native.library.cache_clear()
+        assert (b"avx2" in needed) == ("avx2" in features)
+    np.testing.assert_array_equal(*answers)

@@ -125,6 +125,9 @@ def test_a_shape_survives_its_arrays():
     np.testing.assert_array_equal(again.long_axis_mm, shape().long_axis_mm)
     with pytest.raises(InputError, match=r"1\.values_mm"):
         RestShape.from_arrays({k: v for k, v in arrays.items() if k != "1.values_mm"}, 2)
+    for wrong in (arrays["1.values_mm"][:1], np.full_like(arrays["1.values_mm"], np.nan)):
+        with pytest.raises(InputError):  # a kernel would read beyond it
+            RestShape.from_arrays({**arrays, "1.values_mm": wrong}, 2)
 
 
 def test_the_long_axis_is_the_ellipsoids():

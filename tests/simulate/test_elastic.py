@@ -411,6 +411,8 @@ def test_a_body_survives_a_file(body, unchecked):
         ElasticBody.from_arrays(torn)
     with pytest.raises(InputError, match="NaN"):
         ElasticBody.from_arrays({**body.to_arrays(), "center_ct": np.full(3, np.nan)})
+    with pytest.raises(InputError):  # no cell along an axis: a kernel would read beyond it
+        ElasticBody.from_arrays({**body.to_arrays(), "modes": body.modes[:1]})
 
 
 @pytest.mark.parametrize(

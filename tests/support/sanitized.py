@@ -16,7 +16,7 @@ FLAGS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g", "-O1
 
 
 def main(tests: list[str]) -> int:
-    """Builds the library, and starts Python anew with the sanitizer's own allocator before all."""
+    """Builds the library, and starts a Python with the sanitizer's own allocator before all."""
     sys.path.insert(0, str(ROOT / "tools"))
     import build_backend
 

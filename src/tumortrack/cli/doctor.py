@@ -181,7 +181,7 @@ class Compile:
 
     Attributes:
         model: a case, which gets its model if it has none, or a folder that `train` wrote.
-        device: not used any more.
+        device: of that model.
     """
 
     model: Positional[Path | None] = None

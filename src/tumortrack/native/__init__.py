@@ -105,9 +105,7 @@ def _is_finite(value: np.ndarray) -> bool:
 
 
 F32, F64 = Array(np.float32), Array(np.float64)
-I32, I64, U8, U32, BOOL = (
-    Array(dtype) for dtype in (np.int32, np.int64, np.uint8, np.uint32, np.bool_)
-)
+I32, I64, U8, BOOL = (Array(dtype) for dtype in (np.int32, np.int64, np.uint8, np.bool_))
 
 # What a kernel takes: an array, a float, an int, or a tuple of these.
 Argument = Array | type[float] | type[int] | tuple["Argument", ...]

@@ -21,8 +21,9 @@ ARRAYS(f64, double)
 ARRAYS(i32, int32_t)
 ARRAYS(i64, int64_t)
 ARRAYS(u8, uint8_t)
-ARRAYS(u32, uint32_t)
 ARRAYS(bool, bool)
+
+typedef struct { double fx, fy, cx, cy; } Pinhole;  // a camera's, px
 
 // A kernel gets what the struct of its name holds, whose size the caller compares with its own:
 //     struct twice { f64_1 x; f64_1 out; };

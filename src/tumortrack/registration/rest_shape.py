@@ -118,6 +118,11 @@ class RestShape:
                 vertices, faces, values, origin, spacing = part
                 parts.append(Mesh(vertices, faces))
                 values = np.ascontiguousarray(values, np.float32)
+                if values.ndim != 3 or min(values.shape) < 2 or not np.isfinite(values).all():
+                    raise InputError(
+                        f"the organ's distances {values.shape} are no lattice of finite numbers, "
+                        "two at least along each axis; make the model again."
+                    )
                 fields.append(DistanceField(values, np.asarray(origin, np.float32), float(spacing)))
             ends = f".{_VERTICES}"
             structures = {}

@@ -272,7 +272,7 @@ def part_rows(summary: dict[str, Any]) -> dict[str, dict[str, Any]]:
 def scene_table(entries: list[Entry]) -> Table:
     """For the terminal: each scene, what was done to the organ, the verdict, and how far off the
     farthest tumor is, by the estimate and by the rigid fit."""
-    table, nearer, both = Table(), 0, 0
+    table, pairs = Table(), list[bool]()
     for head in ("scene", "organ", "verdict"):
         table.add_column(head, no_wrap=head != "organ")
     for head in ("off", "rigid fit"):
@@ -282,10 +282,11 @@ def scene_table(entries: list[Entry]) -> Table:
         rigid_mm = rival_center(entry, "rigid_fit", part)
         mm = number(_finite(far_mm), 1), "-" if rigid_mm is None else number(rigid_mm, 1)
         table.add_row(entry["name"], entry.get("words", ""), entry["quality"], *mm)
-        nearer, both = nearer + (far_mm < (rigid_mm or 0)), both + (rigid_mm is not None)
+        if rigid_mm is not None:
+            pairs.append(far_mm < rigid_mm)
     table.caption = (
         "off: the middle of the tumor that is farthest off, mm; nearer than by the rigid fit in "
-        f"{nearer} of {both}"
+        f"{sum(pairs)} of {len(pairs)}"
     )
     return table
 

@@ -18,7 +18,7 @@ static inline float larger_if(bool so, float here, float there) {
 struct z_buffer {
     f32_2 vertices;
     i32_2 faces;
-    struct { double fx, fy, cx, cy; } pinhole;
+    Pinhole pinhole;
     f32_2 seen, nearest;
 };
 KERNEL(void, z_buffer) {

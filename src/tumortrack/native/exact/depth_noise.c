@@ -8,7 +8,6 @@
 
 // Flat indices of the pixels with a return, and where each row starts among them.
 struct seen { i32_1 pixels; i32_1 starts; };
-struct pinhole { double fx, fy, cx, cy; };
 struct row { int64_t first, last; };
 
 // A row's part of the list, within the list even if the list is another image's.
@@ -72,12 +71,12 @@ struct lose_grazing {
     struct seen seen;
     int64_t key;
     double share, cosine;
-    struct pinhole pinhole;
+    Pinhole pinhole;
     f64_1 across;
 };
 KERNEL(void, lose_grazing) {
     const int64_t height = a->depth.n[0], width = a->depth.n[1], key = a->key;
-    const struct pinhole at = a->pinhole;
+    const Pinhole at = a->pinhole;
     const double share = a->share, steep = a->cosine * a->cosine;
     for (int64_t v = 0; v < rows_of(&a->seen, height); v++) {
         const float *const row = a->depth.at + v * width;

@@ -2,8 +2,7 @@
 #include "native.h"
 
 // Of normal errors below margins (n,), 0 or more. ``per_std[which]`` is one over a point's standard
-// deviation. 1: ``which`` names none that there
-// is, and the call has ended; else 0.
+// deviation. 0, or 1 if ``which`` names one that is not there: the call ends at it.
 struct probabilities {
     f32_1 margins;
     f64_1 per_std;

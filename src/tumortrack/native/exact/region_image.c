@@ -78,19 +78,17 @@ KERNEL(void, cloud_tangents) {
     }
 }
 
-struct pinhole { double fx, fy, cx, cy; };
-
 // The nearest depth in each pixel of ``depth``, which is all NaN; and each point's pixel, -1
 // outside.
 struct rasterise {
     f32_2 tangents;
     f32_1 z;
-    struct pinhole pinhole;
+    Pinhole pinhole;
     f32_2 depth;
     i32_1 pixel;
 };
 KERNEL(void, rasterise) {
-    const struct pinhole at = a->pinhole;
+    const Pinhole at = a->pinhole;
     const int64_t height = a->depth.n[0], width = a->depth.n[1];
     const float *restrict const tangents = a->tangents.at, *restrict const depths = a->z.at;
     float *restrict const out = a->depth.at;

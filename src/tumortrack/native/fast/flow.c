@@ -27,13 +27,10 @@ struct follow {
 };
 KERNEL(void, follow) {
     Block block;
-    for (int64_t first = 0; first < a->points.n[0]; first += BLOCK) {
-        const int64_t count = min_i64(BLOCK, a->points.n[0] - first);
-        enter(a->points.at + 3 * first, count, &a->flow, &block);
-        travel(&a->flow, &block, count);
+    for (int64_t first = 0, count; (count = next_block(&a->flow, &a->points, first, &block));
+         first += count)
         for (int64_t p = 0; p < count; p++)
             leave(&a->flow, &block, p, a->out.at + 3 * (first + p));
-    }
 }
 
 // Trilinear values (n, m) of modes at points (n, 3), mm, each along a direction (n, 3); beyond the

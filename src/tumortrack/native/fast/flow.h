@@ -90,6 +90,15 @@ static inline void travel(const Flow *flow, Block *block, int64_t count) {
     }
 }
 
+// Enters the block of points (n, 3) from ``first`` on, and moves it. How many they are: 0 at the end.
+static inline int64_t next_block(
+    const Flow *flow, const f32_2 *points, int64_t first, Block *block) {
+    const int64_t count = min_i64(BLOCK, points->n[0] - first);
+    enter(points->at + 3 * first, count, flow, block);
+    if (count) travel(flow, block, count);
+    return count;
+}
+
 // A place of a block in mm.
 static inline void leave(const Flow *flow, const Block *block, int64_t p, float mm[3]) {
     for (int axis = 0; axis < 3; axis++)

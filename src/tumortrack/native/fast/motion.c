@@ -10,10 +10,8 @@ struct carry {
 KERNEL(void, carry) {
     const double *center = a->pose.center_ct.at, *turn = a->pose.rotation.at;
     Block block;
-    for (int64_t first = 0; first < a->points.n[0]; first += BLOCK) {
-        const int64_t count = min_i64(BLOCK, a->points.n[0] - first);
-        enter(a->points.at + 3 * first, count, &a->flow, &block);
-        travel(&a->flow, &block, count);
+    for (int64_t first = 0, count; (count = next_block(&a->flow, &a->points, first, &block));
+         first += count) {
         for (int64_t p = 0; p < count; p++) {
             float at[3];
             leave(&a->flow, &block, p, at);
@@ -71,10 +69,8 @@ KERNEL(void, effects) {
     const int64_t m = a->row.n[0], unknowns = POSE + m;
     float *row = a->row.at;
     Block block;
-    for (int64_t first = 0; first < a->points.n[0]; first += BLOCK) {
-        const int64_t count = min_i64(BLOCK, a->points.n[0] - first);
-        enter(a->points.at + 3 * first, count, &a->flow, &block);
-        travel(&a->flow, &block, count);
+    for (int64_t first = 0, count; (count = next_block(&a->flow, &a->points, first, &block));
+         first += count) {
         for (int64_t p = 0; p < count; p++) {
             float at[3];
             leave(&a->flow, &block, p, at);

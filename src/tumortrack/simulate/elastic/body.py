@@ -68,7 +68,7 @@ class ElasticBody:
 
     def __post_init__(self) -> None:
         shapes = (self.modes.ndim, self.states.ndim, self.modes.shape[-1])
-        if shapes != (5, 2, self.states.shape[-1]):
+        if shapes != (5, 2, self.states.shape[-1]) or min(self.modes.shape[:3]) < 2:
             raise InputError(
                 f"a body's modes {self.modes.shape} and states {self.states.shape} do not fit; "
                 "build it again."
