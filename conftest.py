@@ -25,7 +25,7 @@ PACKAGES = (
 )
 
 # Left out: core.types, whose constructors convert and check shapes themselves, always; and the
-# __init__.py of packages, with whom all below them would be hooked.
+# __init__.py of packages: with one of them all modules below would be hooked.
 CHECKED = [
     ".".join(path.relative_to(package.parent).with_suffix("").parts)
     for package in PACKAGES

@@ -133,8 +133,9 @@ def _plans(options: Options, world: World, model: Path, made: list[str]) -> Made
         rows += measured(*about, resection.cut_one, **resection.cutting())
         say(f"planned {name} ({method.name})")
     for other in options.beside:
-        for path in sorted((other / "plans").rglob("*.json")):
-            rows += store.read_json(path)["rows"]
+        if not (files := sorted((other / "plans").rglob("*.json"))):
+            raise InputError(f"{other} has no plans; the same command with --plans makes them.")
+        rows += [row for path in files for row in store.read_json(path)["rows"]]
     seen = {(row["case"], row["variant"]) for row in rows}
     good = {(row["case"], row["variant"]) for row in rows if row.get("good")}
     for row in rows:
