@@ -9,15 +9,12 @@ import torch
 from torch import Tensor
 
 from tumortrack.cli.doctor import Compile
-from tumortrack.tracking.model_files import load_model
 from tumortrack_occupancy.config import MlpDecoderConfig, NetworkConfig
-from tumortrack_occupancy.inference import Inference, can_pack, fastest
-from tumortrack_occupancy.locator import OccupancyLocator
+from tumortrack_occupancy.inference import Inference
 from tumortrack_occupancy.network import OccupancyNetwork
 from tumortrack_occupancy.normalisation import CloudBox
 from tumortrack_occupancy.presets import quick_network
 
-CPU = torch.device("cpu")
 QUERIES = 6000  # no whole number of chunks
 STEPS = 150
 
@@ -80,9 +77,8 @@ def known(request) -> Learnt:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("arithmetic", dict.fromkeys(("network", fastest(CPU))))
-def test_fast_arithmetic_gives_the_labels_of_single_precision(arithmetic, known):
-    inference = Inference(known.network, arithmetic)
+def test_bfloat16_gives_the_labels_of_single_precision(known):
+    inference = Inference(known.network, bfloat16=True)
     latent = inference.encode(known.cloud)
     with torch.inference_mode():
         queries = torch.from_numpy(known.queries)[None]
@@ -98,9 +94,8 @@ def test_fast_arithmetic_gives_the_labels_of_single_precision(arithmetic, known)
     torch.testing.assert_close(few, right[:7], atol=3 * near, rtol=0)
 
 
-@pytest.mark.skipif(not can_pack(CPU), reason="oneDNN's layers do not exist here")
 def test_folding_and_splitting_change_nothing_but_rounding(known):
-    inference = Inference(known.network, "float32")
+    inference = Inference(known.network, bfloat16=False)
     with torch.inference_mode():
         cloud, queries = (torch.from_numpy(v)[None] for v in (known.cloud, known.queries))
         whole = known.network(cloud, queries)[0]
@@ -108,7 +103,7 @@ def test_folding_and_splitting_change_nothing_but_rounding(known):
     torch.testing.assert_close(inference.logits(latent, known.queries), whole, atol=1e-3, rtol=1e-4)
 
 
-def test_compile_leaves_the_model_as_it_is_and_older_choices_are_nothing(
+def test_compile_leaves_the_model_as_it_is_and_what_older_versions_kept_there(
     learnt_model, tmp_path, capsys
 ):
     folder = shutil.copytree(learnt_model, tmp_path / "model")
@@ -118,4 +113,3 @@ def test_compile_leaves_the_model_as_it_is_and_older_choices_are_nothing(
     Compile(model=folder, device="cpu").run()
     assert "nothing to compile" in capsys.readouterr().out
     assert sorted(folder.rglob("*")) == before
-    assert OccupancyLocator(load_model(folder, "cpu")).inference.arithmetic == fastest(CPU)

@@ -24,7 +24,6 @@ from tumortrack.report.inspection import describe
 from tumortrack.report.protocol import check_case
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
-from tumortrack_occupancy.inference import can_pack, fastest
 from tumortrack_occupancy.locator import OccupancyLocator
 
 pytestmark = pytest.mark.slow
@@ -214,15 +213,11 @@ def test_clouds_in_other_formats_and_units_agree(work, seen, out):
     assert np.linalg.norm(centres[0] - centres[1]) < 3
 
 
-@pytest.mark.parametrize("numbers", ["network", "float32", "bfloat16"])
-def test_the_estimate_does_not_depend_on_the_arithmetic(tracker, seen, monkeypatch, numbers):
-    points, _ = seen
-    cpu = torch.device("cpu")
-    if not (numbers in ("network", fastest(cpu)) or (numbers == "float32" and can_pack(cpu))):
-        pytest.skip(f"this processor has no fast {numbers}")
-    monkeypatch.setattr("tumortrack_occupancy.inference.fastest", lambda device: numbers)
-    forced = Tracker(tracker.model).locate(SensorCloud(points), grid=32).report
-    usual = tracker.locate(SensorCloud(points), grid=32).report
+@pytest.mark.parametrize("bfloat16", [False, True])
+def test_the_estimate_does_not_depend_on_the_arithmetic(tracker, seen, bfloat16):
+    cloud, usual = SensorCloud(seen[0]), tracker.locate(SensorCloud(seen[0]), grid=32).report
+    locator = OccupancyLocator(tracker.model, bfloat16)
+    forced = locator.locate([Look(cloud, cloud, HERE)], 32, 0).report
     for name in tracker.model.parts:
         apart = np.subtract(forced.parts[name].center_mm, usual.parts[name].center_mm)
         assert np.linalg.norm(apart) < 1.0

@@ -21,6 +21,4 @@ def has_fast_bfloat16(device: torch.device) -> bool:
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     capability = torch.cpu.get_capabilities()
-    has = bool(capability.get("avx512_bf16") or capability.get("amx_bf16"))
-    # oneDNN may be restricted to fewer instructions (ONEDNN_MAX_CPU_ISA).
-    return has and bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
+    return bool(capability.get("avx512_bf16") or capability.get("amx_bf16"))

@@ -36,9 +36,9 @@ class OccupancyLocator:
 
     anatomy_ct: Anatomy | None = None
 
-    def __init__(self, model: OccupancyModel) -> None:
+    def __init__(self, model: OccupancyModel, bfloat16: bool | None = None) -> None:
         self.model = model
-        self.inference = Inference(model.network)
+        self.inference = Inference(model.network, bfloat16)
 
     def locate(
         self,

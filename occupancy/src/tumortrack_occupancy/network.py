@@ -70,7 +70,8 @@ class MlpDecoder(nn.Module):
         return tuple(terms)
 
     def forward(self, terms: tuple[Tensor, ...], queries: Tensor) -> Tensor:
-        """``prepare``'s terms and queries (B, Q, 3) -> logits (B, Q, classes)."""
+        """``prepare``'s terms and queries (B, Q, 3) -> logits (B, Q, classes). Queries stay in
+        single precision under autocast: bf16 rounds a coordinate to a tenth of a millimetre."""
         query = octave_features(queries, self.config.octaves)
         remaining = list(terms)
         hidden: Tensor | None = None
@@ -78,7 +79,8 @@ class MlpDecoder(nn.Module):
             if self._sees_query(number):
                 n_hidden = 0 if hidden is None else hidden.shape[-1]
                 weight = layer.linear.weight[:, : n_hidden + self.query_size]
-                out = functional.linear(query, weight[:, n_hidden:]) + remaining.pop(0)
+                with torch.autocast(query.device.type, enabled=False):
+                    out = functional.linear(query, weight[:, n_hidden:]) + remaining.pop(0)
                 if hidden is not None:
                     out += functional.linear(hidden, weight[:, :n_hidden])
                 hidden = layer.activate(out)

@@ -108,8 +108,7 @@ class _Level(nn.Module):
         *layers, last = self.rest
         for layer in layers:
             hidden = layer(hidden)
-        if not isinstance(last, Layer):  # packed, for inference
-            return max_over_neighbours(last(hidden))
+        assert isinstance(last, Layer)
         # ReLU after the maximum gives the same numbers and gradients, for a K-th of the work.
         out = last.normalise(last.linear(hidden))
         return functional.relu(max_over_neighbours(out))
