@@ -15,7 +15,8 @@ from jaxtyping import Float64
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import read_rigid
-from tumortrack.core.store import read_json
+from tumortrack.core.store import MANIFEST, read_json, sha256_of
+from tumortrack.imaging.case import Case, load_case
 
 KIT_FILE = "kit.json"
 LEAST_BEADS = 4  # three fix a frame; the fourth shows that one of them is wrong
@@ -80,3 +81,14 @@ def read_kit(folder: Path) -> Kit:
     kit = from_builtins(read_json(path), Kit, str(path))
     read_rigid(kit.base_from_ct, "mm", f"{path}: base_from_ct")
     return kit
+
+
+def case_of_kit(folder: Path, kit: Kit) -> Case:
+    """The case in a folder. Raises InputError: none, or not the one that the kit was made of."""
+    case = load_case(folder)
+    if sha256_of(folder / MANIFEST) != kit.case_sha256:
+        raise InputError(
+            f"{folder} is not the case that this kit was made of, so its tumors lie elsewhere. "
+            "Give the case that `tumortrack phantom-kit` was given."
+        )
+    return case

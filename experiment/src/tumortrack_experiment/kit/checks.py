@@ -7,23 +7,21 @@ from collections.abc import Iterator
 import numpy as np
 
 from tumortrack.core.config import Config
-from tumortrack.core.types import Mesh
 from tumortrack_experiment.kit.base import Base, BaseConfig, eyes_mm, seen_beads
 from tumortrack_experiment.kit.mold import MoldConfig, OrganMold
-from tumortrack_experiment.kit.mold_checks import open_edges
+from tumortrack_experiment.kit.mold_checks import LINES_MM, open_edges, thin_share
 from tumortrack_experiment.kit.split import fits, laid_mesh
 from tumortrack_experiment.kit.stands import COMPRESSION_MM, PLATE_MM, midsection_top_mm
 from tumortrack_experiment.kit.values import PrintedPart
 from tumortrack_experiment.kit_file import LEAST_BEADS
 
 _LEAST_SHOWN = 0.01
-_RAYS, _LINES_MM = 2000, 1.2  # three lines of a nozzle of 0.4 mm: thinner walls break
 # By name: what it is, unit, least, most, and whether the kit is of no use beyond.
 _COUNT, _YES = "", "yes or no"  # units
 _LIMITS: dict[str, tuple[str, str, float | None, float | None, bool]] = {
     "open_edges": ("edges that are open after STL", _COUNT, 0, 0, True),
     "fits_bed": ("fits the printer's bed", _YES, 1, 1, True),
-    "least_wall_mm": ("least wall", "mm", _LINES_MM, None, False),
+    "least_wall_mm": ("least wall", "mm", LINES_MM, None, False),
     "thin_percent": ("surface with less than 1.2 mm of material", "%", None, 5, False),
     "cast_error_percent": ("error of the cast's volume", "%", -1, 1, True),
     "cast_differs_mm": ("mean error of the cast's surface", "mm", None, 0.2, False),
@@ -127,14 +125,3 @@ def plate_height_mm(part: PrintedPart) -> float:
     x, y, _ = part.mesh.box_mm.mean(0) + 0.1  # beside the edges between triangles
     hits, _, _ = solid.ray.intersects_location([[x, y, -1.0]], [[0.0, 0.0, 1.0]])
     return float(hits[:, 2].min())
-
-
-def thin_share(mesh: Mesh) -> float:
-    """Share of a solid's surface with less than 1.2 mm of it behind."""
-    import trimesh
-
-    solid = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False)
-    points, face = trimesh.sample.sample_surface(solid, _RAYS, seed=0)
-    inward = -solid.face_normals[face]
-    ends, ray, _ = solid.ray.intersects_location(points + 1e-3 * inward, inward, False)
-    return float((np.linalg.norm(ends - points[ray], axis=1) < _LINES_MM).mean())

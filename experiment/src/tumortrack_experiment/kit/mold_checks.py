@@ -14,7 +14,7 @@ from tumortrack_experiment.kit.casting import Halves, Layout
 
 _STEPS_MM = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)  # of a part that is pulled off
 _RAYS = 4000
-_LINES_MM = 1.2  # three lines of a nozzle of 0.4 mm: thinner walls break
+LINES_MM = 1.2  # three lines of a nozzle of 0.4 mm: thinner walls break
 _TOUCH_MM = 0.05
 
 
@@ -31,21 +31,31 @@ def open_edges(mesh: Mesh) -> int:
     return int((counts % 2 != 0).sum())
 
 
+def thin_share(mesh: Mesh) -> float:
+    """Share of a solid's surface with less than 1.2 mm of it behind."""
+    return float((_depths(mesh)[2] < LINES_MM).mean())
+
+
 def walls(mesh: Mesh, layout: Layout) -> tuple[float, float]:
-    """Least thickness of a half's wall between cavity and outside, mm, and the share of all its
-    surface with less than 1.2 mm behind it (its edges), by rays evenly over it and square to it."""
+    """Least thickness of a half's wall between cavity and outside, mm, and ``thin_share``."""
+    start, ends, deep = _depths(mesh)
+    outside = layout.beyond(ends) > -_TOUCH_MM
+    sides = np.abs(ends[:, 2, None] - [layout.top_mm, layout.bottom_mm])
+    outside |= sides.min(1) < _TOUCH_MM
+    cavity = distance_to_surface(start, layout.mesh) < _TOUCH_MM
+    return float(deep[outside & cavity].min(initial=np.inf)), float((deep < LINES_MM).mean())
+
+
+def _depths(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rays evenly over a solid's surface and square to it: where each starts and ends, and how
+    long it is in the solid, mm."""
     import trimesh
 
     solid = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False)
     points, face = trimesh.sample.sample_surface(solid, _RAYS, seed=0)
     inward = -solid.face_normals[face]
     ends, ray, _ = solid.ray.intersects_location(points + 1e-3 * inward, inward, False)
-    start = points[ray]
-    deep, z = np.linalg.norm(ends - start, axis=1), ends[:, 2]
-    outside = layout.beyond(ends) > -_TOUCH_MM
-    outside |= np.minimum(np.abs(z - layout.top_mm), np.abs(z - layout.bottom_mm)) < _TOUCH_MM
-    cavity = distance_to_surface(start, layout.mesh) < _TOUCH_MM
-    return float(deep[outside & cavity].min(initial=np.inf)), float((deep < _LINES_MM).mean())
+    return points[ray], ends, np.linalg.norm(ends - points[ray], axis=1)
 
 
 def demould(part: Any, organ: Any, organ_mesh: Mesh, pull: Float64[np.ndarray, " 3"]) -> float:

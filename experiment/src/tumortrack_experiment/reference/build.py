@@ -16,12 +16,11 @@ from tumortrack.imaging.case import Case
 from tumortrack.imaging.volume import read_volume
 from tumortrack.simulate.scene_folder import Scene, Targets
 from tumortrack.tracking.points import read_points
-from tumortrack_experiment.kit_file import Kit, kit_path, read_kit
+from tumortrack_experiment.kit_file import Kit, case_of_kit, kit_path, read_kit
 from tumortrack_experiment.record.read import Moment, Recorded
 from tumortrack_experiment.reference import scenes
-from tumortrack_experiment.reference.case import case_of_kit
+from tumortrack_experiment.reference.command import Reference
 from tumortrack_experiment.reference.deformed import parts_in, segment_deformed
-from tumortrack_experiment.reference.options import ReferenceOptions
 from tumortrack_experiment.register.beads import CT, NamedBeads, name_beads, register
 from tumortrack_experiment.register.build import say_registration
 from tumortrack_experiment.register.frames import (
@@ -37,7 +36,7 @@ from tumortrack_experiment.register.in_ct import find_balls, middles_mm
 _MOVED_MM = 1.5  # beads' noise in two states is half of it
 
 
-def write_reference(given: ReferenceOptions) -> None:
+def write_reference(given: Reference) -> None:
     """Raises InputError: CT, recording, kit and case do not belong together, or cannot be read."""
     kit = read_kit(given.kit)
     case = case_of_kit(given.case, kit)
@@ -122,7 +121,7 @@ def _moved(
 
 
 def _targets(
-    given: ReferenceOptions, case: Case, found_mm: np.ndarray, camera_from_rest: np.ndarray
+    given: Reference, case: Case, found_mm: np.ndarray, camera_from_rest: np.ndarray
 ) -> Targets:
     """Beads in the organ, of both CTs. Nothing else in it is known to be the same point."""
     assert given.target_mm is not None

@@ -16,9 +16,8 @@ from tumortrack.imaging.volume import read_volume
 from tumortrack.live.calibration_file import CalibrationFile
 from tumortrack.sense.files import read_depth_png
 from tumortrack.tracking.points import read_points
-from tumortrack_experiment.kit_file import Kit, kit_path, read_kit
+from tumortrack_experiment.kit_file import Kit, case_of_kit, kit_path, read_kit
 from tumortrack_experiment.record.read import Moment
-from tumortrack_experiment.reference.case import case_of_kit
 from tumortrack_experiment.register.beads import (
     CT,
     ROBOT,
@@ -27,14 +26,14 @@ from tumortrack_experiment.register.beads import (
     name_beads,
     register,
 )
+from tumortrack_experiment.register.command import CalibrateRegister
 from tumortrack_experiment.register.frames import moments_in, still_beads
 from tumortrack_experiment.register.in_ct import find_balls, middles_mm
-from tumortrack_experiment.register.options import RegisterOptions
 
 _ORGAN_MM = [[0.0, 0.0, 25.0]]  # without a case: half an organ's height above the plate
 
 
-def write_registration(given: RegisterOptions) -> None:
+def write_registration(given: CalibrateRegister) -> None:
     """Raises InputError: see what finds and registers beads."""
     kit = read_kit(given.kit)
     base_mm = targets_mm(given.case, kit)
@@ -91,7 +90,7 @@ def targets_mm(case: Path | None, kit: Kit) -> dict[str, Points]:
     }
 
 
-def _moments(view: Path, given: RegisterOptions, kit: Kit) -> list[Moment]:
+def _moments(view: Path, given: CalibrateRegister, kit: Kit) -> list[Moment]:
     if view.suffix.lower() == ".png":
         beside = given.intrinsics or view.parent / "intrinsics.json"
         return [Moment(read_depth_png(view, beside))]
@@ -100,7 +99,7 @@ def _moments(view: Path, given: RegisterOptions, kit: Kit) -> list[Moment]:
     return moments_in(view, given.state, kit)
 
 
-def _pointed(kit: Kit, path: Path, given: RegisterOptions) -> NamedBeads:
+def _pointed(kit: Kit, path: Path, given: CalibrateRegister) -> NamedBeads:
     """Raises InputError: as ``name_beads``, or a place is not that of the bead it is named for."""
     table = read_points(path)
     points_mm = table.points_ct * (1000.0 if given.unit == "m" else 1.0)
@@ -119,7 +118,7 @@ def _pointed(kit: Kit, path: Path, given: RegisterOptions) -> NamedBeads:
     return found
 
 
-def _calibration(given: RegisterOptions, one: Registration, at_mm: Points) -> dict[str, Any]:
+def _calibration(given: CalibrateRegister, one: Registration, at_mm: Points) -> dict[str, Any]:
     bound_mm = one.bound_mm(at_mm)
     file = CalibrationFile(
         frame_id=given.frame_id,
