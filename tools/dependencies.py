@@ -28,14 +28,10 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parents[1]
 LOCKS = ROOT / "requirements"
 TABLE = ROOT / "docs" / "data" / "dependencies.csv"
-OWN = (
+OWN = [
     "tumortrack",
-    "tumortrack-devices",
-    "tumortrack-occupancy",
-    "tumortrack-resection",
-    "tumortrack-lab",
-    "tumortrack-experiment",
-)
+    *(f"tumortrack-{n}" for n in ("devices", "occupancy", "resection", "lab", "experiment")),
+]
 _APART = {"ur-rtde": "ur"}  # in a file of its own: `make setup` leaves it out
 
 # Licences that ask for no more than to be named, and those that bind only changes of the package
@@ -45,23 +41,16 @@ ALLOWED = {
     "ISC", "LGPL", "LLVM-exception", "MIT", "MIT-CMU", "MPL-2.0", "PSF-2.0", "Qhull", "Unlicense",
     "Zlib",
 }  # fmt: skip
-# What packages say that say it otherwise, as found in their metadata or, with the reason, in their
-# licence file.
+# What packages say that say it otherwise.
 SAID = {
-    "apache software license": "Apache-2.0",
-    "apache 2.0": "Apache-2.0",
-    "apache license 2.0": "Apache-2.0",
-    "apache license, version 2.0": "Apache-2.0",
-    "bsd license": "BSD",
-    "3-clause bsd license": "BSD-3-Clause",
-    "isc license (iscl)": "ISC",
-    "mit license": "MIT",
-    "mozilla public license 2.0 (mpl 2.0)": "MPL-2.0",
-    "python software foundation license": "PSF-2.0",
-    "zlib license": "Zlib",
-    "epl-2.0, bsd-3-clause": "EPL-2.0 OR BSD-3-Clause",
-    "osi approved": "",
-}
+    "apache software license": "Apache-2.0", "apache 2.0": "Apache-2.0",
+    "apache license 2.0": "Apache-2.0", "apache license, version 2.0": "Apache-2.0",
+    "bsd license": "BSD", "3-clause bsd license": "BSD-3-Clause", "isc license (iscl)": "ISC",
+    "mit license": "MIT", "mozilla public license 2.0 (mpl 2.0)": "MPL-2.0",
+    "python software foundation license": "PSF-2.0", "zlib license": "Zlib",
+    "epl-2.0, bsd-3-clause": "EPL-2.0 OR BSD-3-Clause", "osi approved": "",
+}  # fmt: skip
+# With the reason, as found in their licence file.
 STATED = {
     "apsw": "Zlib",  # "any-OSI" in its metadata; LICENSE: the zlib licence
     "cmeel-qhull": "Qhull",  # nothing in its metadata; COPYING.txt: free, with attribution
@@ -213,27 +202,21 @@ def licence(package: Distribution) -> str:
         return STATED[name]
     if expression := about.get("License-Expression"):
         return str(expression)
-    prefix = "License :: "
-    classes = [
-        text.split(" :: ")[-1]
-        for text in about.get_all("Classifier") or []
-        if text.startswith(prefix)
-    ]
+    classifiers = about.get_all("Classifier") or []
+    classes = [text.split(" :: ")[-1] for text in classifiers if text.startswith("License :: ")]
     words = classes or [str(about.get("License") or "").strip().partition("\n")[0]]
     names = [SAID.get(word.lower(), word) for word in words]
     return " AND ".join(dict.fromkeys(filter(None, names)))
 
 
 def is_allowed(expression: str) -> bool:
-    """Whether each licence of an expression is allowed, or one of each OR."""
-
-    def holds(text: str) -> bool:
-        return all(part.strip("() ") in ALLOWED for part in re.split(r"\bAND\b|\bWITH\b", text))
-
-    ways = re.split(r"\bOR\b", expression)
-    if "(" in expression:  # not taken apart: all must be allowed
-        return all(map(holds, ways))
-    return any(map(holds, ways))
+    """Whether each licence of an expression is allowed, or one of each OR; all of them where there
+    are brackets, which are not taken apart."""
+    ways = [
+        all(part.strip("() ") in ALLOWED for part in re.split(r"\bAND\b|\bWITH\b", way))
+        for way in re.split(r"\bOR\b", expression)
+    ]
+    return all(ways) if "(" in expression else any(ways)
 
 
 def table() -> str:
@@ -242,9 +225,12 @@ def table() -> str:
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow(("package", "version", "licence"))
     for _, package in sorted(everything().items()):
-        name, version = package.metadata["Name"], package.version.split("+")[0]
-        rows.writerow((name, version, licence(package)))
+        rows.writerow((package.metadata["Name"], version_of(package), licence(package)))
     return text.getvalue()
+
+
+def version_of(package: Distribution) -> str:
+    return package.version.split("+")[0]
 
 
 def sbom(wheel: Path) -> dict[str, Any]:
@@ -255,42 +241,28 @@ def sbom(wheel: Path) -> dict[str, Any]:
     extras = set(distribution(name).metadata.get_all("Provides-Extra") or ()) - {"dev", "docs"}
     packages = needed(name, extras)
     packages.pop(name)
-    components = [_component(key, package, locked) for key, package in sorted(packages.items())]
-    top = {
-        "type": "library", "name": name, "version": version, "bom-ref": name,
-        "purl": f"pkg:pypi/{name}@{version}", "licenses": [{"expression": "Apache-2.0"}],
-    }  # fmt: skip
+
+    def part(key: str, title: str, version: str, licence: dict[str, Any]) -> dict[str, Any]:
+        about = {"type": "library", "name": title, "version": version, "bom-ref": key}
+        return {**about, "purl": f"pkg:pypi/{key}@{version}", "licenses": [licence]}
+
+    components = []
+    for key, package in sorted(packages.items()):
+        stated, version_needed = {"name": licence(package)}, version_of(package)
+        made = part(key, package.metadata["Name"], version_needed, {"license": stated})
+        digests = locked[key][1] if key in locked else []
+        made["externalReferences"] = [{
+            "type": "distribution", "url": f"https://pypi.org/project/{key}/{version_needed}/",
+            "hashes": [{"alg": "SHA-256", "content": digest} for digest in digests],
+        }]  # fmt: skip
+        components.append(made)
     return {
         "bomFormat": "CycloneDX",
         "specVersion": "1.6",
         "version": 1,
-        "metadata": {"component": top},
+        "metadata": {"component": part(name, name, version, {"expression": "Apache-2.0"})},
         "components": components,
-        "dependencies": [
-            {"ref": name, "dependsOn": [component["bom-ref"] for component in components]},
-        ],
-    }
-
-
-def _component(
-    key: str, package: Distribution, locked: dict[str, tuple[str, list[str]]]
-) -> dict[str, Any]:
-    version = package.version.split("+")[0]
-    digests = locked[key][1] if key in locked else []
-    return {
-        "type": "library",
-        "name": package.metadata["Name"],
-        "version": version,
-        "bom-ref": key,
-        "purl": f"pkg:pypi/{key}@{version}",
-        "licenses": [{"license": {"name": licence(package)}}],
-        "externalReferences": [
-            {
-                "type": "distribution",
-                "url": f"https://pypi.org/project/{key}/{version}/",
-                "hashes": [{"alg": "SHA-256", "content": digest} for digest in digests],
-            }
-        ],
+        "dependencies": [{"ref": name, "dependsOn": sorted(packages)}],
     }
 
 
@@ -303,11 +275,8 @@ def main(arguments: list[str]) -> int:
             print("\n".join(wrong) or "every pin has a wheel for every Python and machine")
             return len(wrong) > 0
         case ["licences"]:
-            refused = {
-                name: licence(package)
-                for name, package in everything().items()
-                if not is_allowed(licence(package))
-            }
+            said = {name: licence(package) for name, package in everything().items()}
+            refused = {name: words for name, words in said.items() if not is_allowed(words)}
             for name, words in refused.items():
                 print(f"{name}: the licence {words or 'is not stated, which'!r} is not allowed")
             return len(refused) > 0

@@ -1,25 +1,26 @@
 """What MkDocs asks while it builds the site (`hooks` in mkdocs.yml).
 
-Makes reference/cli.md of the commands' own parsers, takes CONTRIBUTING.md and CHANGELOG.md in as
+Makes reference/cli.md of what `--help` says, takes CONTRIBUTING.md and CHANGELOG.md in as
 pages, turns links that leave docs/ into plain text (the site must work without the repository),
 and shows a table that is a CSV file in docs/data/ where a link to it is a paragraph by itself.
 """
 
 from __future__ import annotations
 
-import argparse
+import io
+import os
 import posixpath
 import re
-import warnings
 from collections.abc import Iterator
+from contextlib import redirect_stdout, suppress
 from html import escape
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
-import tyro
 from mkdocs.structure.files import File, Files
 
-from tumortrack.cli.main import _commands as all_commands
+from tumortrack.cli.main import run
 from tumortrack_lab.study.document import MeasuredTable
 
 ROOT = Path(__file__).parents[1]
@@ -87,71 +88,20 @@ def data_table(path: Path, text: str, link: str) -> str:
 
 
 def command_line() -> str:
-    """Every command with its options, as `--help` has them."""
-    text = [
-        "# Command line\n",
-        "This page is generated from the code: it says what `tumortrack COMMAND --help` says.\n",
-        "| command | |\n|---|---|",
-    ]
-    parsers = [
-        (f"tumortrack {name}", parser)
-        for name, command in all_commands("").items()
-        for parser in [_parser(command, name)]
-    ]
-    text += [
-        f"| [`{words}`](#{words.replace(' ', '-')}) | {_first(parser)} |"
-        for words, parser in parsers
-    ]
-    for words, parser in parsers:
-        text += _section(words, parser, 2)
-    return "\n".join(text) + "\n"
+    """What `--help` says of every command."""
+    os.environ.update(COLUMNS="100", NO_COLOR="1", TERM="dumb")
+    return "# Command line\n" + "".join(section())
 
 
-def _parser(command: Any, name: str) -> argparse.ArgumentParser:
-    with warnings.catch_warnings():
-        # tyro means to drop it; what it would be replaced by is the text of --help, in boxes.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        return tyro.extras.get_parser(command, prog=f"tumortrack {name}")
-
-
-def _first(parser: argparse.ArgumentParser) -> str:
-    return " ".join((parser.description or "").split("\n\n")[0].split())
-
-
-def _section(words: str, parser: argparse.ArgumentParser, level: int) -> Iterator[str]:
-    yield f"\n{'#' * level} {words}\n"
-    yield (parser.description or "").strip() + "\n"
-    rows, below = [], []
-    for action in parser._actions:
-        if isinstance(action, argparse._SubParsersAction):
-            below += [(f"{words} {name}", subparser) for name, subparser in action.choices.items()]
-        elif action.dest != "help":
-            rows.append(_row(action))
-    places = [_place(action) for action in parser._actions if _positional(action)]
-    places += ["KIND"] * bool(below)
-    yield f"```text\n{' '.join([words, *places, '[OPTIONS]'])}\n```\n"
-    if rows:
-        yield "| | value | meaning |\n|---|---|---|"
-        yield from rows
-    for name, subparser in below:
-        yield from _section(name, subparser, level + 1)
-
-
-def _positional(action: argparse.Action) -> bool:
-    return not action.option_strings and not isinstance(action, argparse._SubParsersAction)
-
-
-def _place(action: argparse.Action) -> str:
-    """The name of what stands there: a bare PATH would not tell the input from the output."""
-    name = action.dest.upper().replace("_", "-")
-    return f"[{name} ...]" if action.nargs == "*" else name
-
-
-def _row(action: argparse.Action) -> str:
-    name = ", ".join(f"`{option}`" for option in action.option_strings)
-    value = re.sub(r"\{None\}\||None,", "", str(action.metavar or ""))
-    meaning = " ".join((action.help or "").split()).replace(" (default: None)", "")
-    if not action.option_strings:
-        name, value = f"`{_place(action)}`", ""
-    cells = (name, f"`{value}`" if value else "", meaning)
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+def section(*words: str) -> Iterator[str]:
+    """Of one command, and of those below it, which its usage names at its end."""
+    output = io.StringIO()
+    with redirect_stdout(output), suppress(SystemExit):
+        run([*words, "--help"])
+    lines = output.getvalue().strip().splitlines()
+    text = "\n".join(line.rstrip() if len(line) <= 100 else fill(line, 100) for line in lines)
+    yield f"\n{'#' * min(2 + len(words), 4)} {' '.join(['tumortrack', *words])}\n"
+    yield f"\n```text\n{text}\n```\n"
+    if below := re.search(r"\{([a-z,-]+)\}$", lines[0]):
+        for name in below[1].split(","):
+            yield from section(*words, name)

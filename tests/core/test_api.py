@@ -3,14 +3,12 @@
 import inspect
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import tumortrack as tt
-from live_objects import ball
-from tumortrack.tracking.tracker import _parted
+from live_objects import ball, small_estimate
 
 # A name or a parameter that goes or changes its meaning breaks users' scripts: think twice.
 SIGNATURES = {
@@ -39,15 +37,14 @@ SIGNATURES = {
     "progress=None",
     "write_scenes": "case folder progress=None options",
 }
-VALUES = {
-    "Case", "DepthFrame", "Estimate", "Free", "Held", "Intrinsics", "Landmark", "Look", "Outline",
-    "SensorCloud", "Touch", "Tracker",
-}  # fmt: skip
-MODULES = {"datasets", "errors", "presets"}
+OTHERS = {
+    *("Case", "DepthFrame", "Estimate", "Free", "Held", "Intrinsics", "Landmark", "Look"),
+    *("Outline", "SensorCloud", "Touch", "Tracker", "datasets", "errors", "presets"),
+}
 
 
 def test_the_public_names_and_their_parameters():
-    assert set(tt.__all__) == set(SIGNATURES) | VALUES | MODULES
+    assert set(tt.__all__) == set(SIGNATURES) | OTHERS
     for name, wanted in SIGNATURES.items():
         given = [
             parameter.name
@@ -57,29 +54,18 @@ def test_the_public_names_and_their_parameters():
         assert " ".join(given) == wanted, name
 
 
-@pytest.mark.parametrize("name", sorted(set(tt.__all__) - MODULES))
-def test_every_name_has_a_docstring_with_what_it_raises(name):
-    text = inspect.getdoc(getattr(tt, name)) or ""
-    assert len(text) > 40
-    if name in SIGNATURES and name not in ("estimate_from_surfaces", "simulate_scenes"):
-        assert "Raises:" in text
-
-
 def test_importing_the_package_loads_nothing_heavy():
     code = "import sys, tumortrack; dir(tumortrack); print(*sys.modules)"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not {"torch", "numpy", "scipy"} & set(said.stdout.split())
 
 
-def test_an_unknown_name_is_an_attribute_error():
-    with pytest.raises(AttributeError, match="no attribute 'prepair'"):
+def test_unknown_names_and_options_are_refused(tmp_path, unchecked):
+    with pytest.raises(AttributeError):
         tt.prepair  # noqa: B018
-
-
-def test_unknown_options_are_refused_with_those_there_are(tmp_path, unchecked):
-    with pytest.raises(tt.errors.InputError, match=r"no 'kidney'.*organ_hu"):
+    with pytest.raises(tt.errors.InputError, match=r"kidney.*organ_hu"):
         tt.prepare(tmp_path, kidney=(1, 2))
-    with pytest.raises(tt.errors.InputError, match="preset 'fast'; allowed: clinic"):
+    with pytest.raises(tt.errors.InputError, match=r"fast.*clinic"):
         tt.train(tmp_path, tmp_path, preset="fast")
 
 
@@ -87,8 +73,7 @@ def test_surfaces_become_an_estimate_that_compares_as_equal():
     organ = ball((0.0, 0.0, 150.0), 30.0)
     tumor = ball((20.0, 0.0, 150.0), 8.0)
     made = tt.estimate_from_surfaces({"kidney": organ, "tumor_1": tumor}, grid=80)
-    inside = made.report.parts
-    assert inside["kidney"].volume_ml == pytest.approx(organ.volume_mm3 / 1000)
+    assert made.report.parts["kidney"].volume_ml == pytest.approx(organ.volume_mm3 / 1000)
     voxel_ml = made.report.voxel_mm**3 / 1000
     counted = np.bincount(made.volume.labels.reshape(-1))[1:] * voxel_ml
     assert counted.sum() == pytest.approx(organ.volume_mm3 / 1000, rel=0.02)
@@ -96,7 +81,6 @@ def test_surfaces_become_an_estimate_that_compares_as_equal():
 
 
 WRONG = """
-from functools import partial
 import numpy as np
 import tumortrack as tt
 from tumortrack.core.errors import InputError
@@ -112,7 +96,7 @@ for call in (
     lambda: tt.find_organ(cloud, model="CASE"),
     lambda: tt.simulate_scenes("CASE"),
     lambda: tt.locate(unmade, "cloud.ply"),
-    *(partial(unmade.locate, cloud, evidence=given) for given in EVIDENCE),
+    *((lambda given=given: unmade.locate(cloud, evidence=given)) for given in EVIDENCE),
 ):
     try:
         call()
@@ -126,33 +110,21 @@ def test_other_types_are_refused_with_the_call_that_makes_the_right_ones():
     done = subprocess.run(
         [sys.executable, "-c", WRONG], capture_output=True, text=True, check=False
     )
-    tracker, locate, none, function, *others = done.stdout.splitlines()
-    assert len(others) == 3 + 6, done.stderr
-    assert tracker.endswith("not str: Tracker(load_case(FOLDER)).")
-    assert "not ndarray: read_cloud(FILE)" in locate
-    assert none.startswith("there are no scenes to evaluate")
-    assert "a tracker or a function, not int" in function
+    tracker, locate, *others = done.stdout.splitlines()
+    assert len(others) == 5 + 6, done.stderr
+    assert "Tracker(load_case(FOLDER))" in tracker
+    assert "read_cloud(FILE)" in locate
 
 
 def test_an_echoed_estimate_is_a_few_lines():
-    from live_objects import small_estimate
-
     said = repr(small_estimate()).splitlines()
     assert len(said) < 12
     assert max(map(len, said)) < 300
     assert sum("center_mm=" in line for line in said) == len(small_estimate().report.parts)
 
 
-def test_a_single_piece_of_evidence_stands_for_a_sequence():
-    touch = tt.Touch(place_mm=(0.0, 0.0, 150.0))
-    cloud = tt.SensorCloud(np.ones((3, 3), np.float32))
-    for given in (touch, [touch], (touch,)):
-        assert _parted(cloud, None, given)[1] == (touch,)
-
-
-def test_scenes_are_not_written_among_other_files(tmp_path, monkeypatch):
-    monkeypatch.setattr("tumortrack.api.load_case", lambda case: SimpleNamespace(anatomy=None))
+def test_scenes_are_not_written_among_other_files(phantom_case, tmp_path):
     (tmp_path / "thesis.txt").touch()
     with pytest.raises(tt.errors.InputError, match=r"thesis\.txt"):
-        tt.write_scenes("case", tmp_path, scenes=1)
+        tt.write_scenes(phantom_case, tmp_path, scenes=1)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]

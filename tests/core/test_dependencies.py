@@ -4,18 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import re
 import tomllib
-from importlib.metadata import distributions
 from pathlib import Path
 from types import ModuleType
-from xml.etree import ElementTree
 
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
-
-import clients
 
 ROOT = Path(__file__).parents[2]
 
@@ -45,9 +40,7 @@ def test_every_range_is_locked_to_a_version_in_it_by_hash(tool):
     locked = tool.versions()
     assert len(asked_for()) > 45
     for requirement in asked_for():
-        version, digests = locked[canonicalize_name(requirement.name)]
-        assert version in requirement.specifier, f"{requirement}: run make lock"
-        assert digests
+        assert locked[canonicalize_name(requirement.name)][0] in requirement.specifier
     assert all(digests for _, digests in locked.values())
     cpu = tool.pinned((ROOT / "requirements/torch-cpu.txt").read_text("utf-8"))["torch"]
     assert cpu.startswith(f"torch=={locked['torch'][0]}+cpu")
@@ -56,25 +49,11 @@ def test_every_range_is_locked_to_a_version_in_it_by_hash(tool):
 def test_what_is_installed_is_what_is_locked_and_its_licences_are_listed(tool):
     locked = tool.versions()
     for name, package in tool.everything().items():
-        assert package.version.split("+")[0] == locked[name][0], f"{name}: run make setup"
+        assert tool.version_of(package) == locked[name][0], f"{name}: run make setup"
     assert tool.main(["licences"]) == 0
     rows, made = (set(text.splitlines()) for text in (tool.TABLE.read_text("utf-8"), tool.table()))
     assert len(made) > 50
     assert made <= rows, "run make licences"  # some are for one Python or machine alone
-
-
-def test_licences_of_other_makers_programs_are_allowed(tool):
-    """ROS's packages say theirs in package.xml alone."""
-    clients.environment("ros-jazzy-rclpy")
-    (site,) = clients.FOLDER.glob("lib/python3*/site-packages")
-    for package in distributions(path=[str(site)]):
-        name = canonicalize_name(package.metadata["Name"])
-        if not (said := tool.licence(package)):
-            folder = re.sub("^ros-(jazzy-)?", "", name).replace("-", "_")
-            about = ElementTree.parse(clients.FOLDER / "share" / folder / "package.xml")
-            stated = [one.text for one in about.iter("license")]
-            said = " AND ".join(tool.SAID.get(text.lower(), text) for text in stated)
-        assert tool.is_allowed(said), f"{name}: {said!r}"
 
 
 @pytest.mark.parametrize(
@@ -83,11 +62,9 @@ def test_licences_of_other_makers_programs_are_allowed(tool):
         ("MIT", True),
         ("Apache-2.0 WITH LLVM-exception AND MIT", True),
         ("GPL-3.0-only OR MIT", True),
-        ("(Apache-2.0 OR GPL-2.0) AND MIT", False),  # not taken apart so far: a person looks
+        ("(Apache-2.0 OR GPL-2.0) AND MIT", False),  # not taken apart: a person looks
         ("GPL-3.0-only", False),
-        ("AGPL-3.0-or-later", False),
         ("MIT AND GPL-2.0-only", False),
-        ("GNU General Public License v3 (GPLv3)", False),
         ("", False),
         ("whatever", False),
     ],
@@ -97,14 +74,11 @@ def test_which_licences_are_allowed(tool, expression, allowed):
 
 
 def test_a_wheel_comes_with_what_it_needs(tool, tmp_path):
-    wheel = tmp_path / "tumortrack-0.2.0-py3-none-any.whl"
-    assert tool.main(["sbom", str(wheel)]) == 0
+    assert tool.main(["sbom", str(tmp_path / "tumortrack-0.2.0-py3-none-any.whl")]) == 0
     bom = json.loads((tmp_path / "tumortrack-0.2.0-py3-none-any.cdx.json").read_text("utf-8"))
-    assert (bom["bomFormat"], bom["specVersion"]) == ("CycloneDX", "1.6")
     parts = {part["bom-ref"]: part for part in bom["components"]}
     version, digests = tool.versions()["websockets"]  # not asked for itself: viser brings it
     assert parts["websockets"]["purl"] == f"pkg:pypi/websockets@{version}"
     (reference,) = parts["websockets"]["externalReferences"]
     assert {one["content"] for one in reference["hashes"]} == set(digests)
-    assert "ruff" not in parts  # developers' own
-    assert "tumortrack" not in parts
+    assert not {"ruff", "tumortrack"} & parts.keys()  # developers' own, and itself

@@ -1,36 +1,37 @@
-"""Halts of arms: compared by kind, whatever their numbers. Every kind has a sentence."""
+"""Halts of arms are compared by kind, whatever their numbers; every kind has a sentence."""
 
+import tomllib
+from importlib.resources import files
 from typing import get_args
 
-from tumortrack.core import halt, report
-from tumortrack.core.halt import CUT_NOTE, Halt
-from tumortrack.core.report import Finding
+import msgspec
 
-
-def moved(part, off_mm, cut=False):
-    return Halt("moved", {"part": part, "off_mm": off_mm}, cut=cut)
-
-
-def without_frame(seconds):
-    finding = Finding("no_frame", {"seconds": seconds})
-    return Halt("no_estimate", {"words": finding.words}, finding)
+from tumortrack.core.halt import CUT_NOTE, Halt, HaltKind
+from tumortrack.core.report import Finding, Kind
 
 
 def test_halts_that_differ_in_numbers_alone_are_the_same():
-    first, second = moved("tumor_1", 2.04), moved("tumor_1", 13.0)
+    first, second = (Halt("moved", {"part": "tumor_1", "off_mm": mm}) for mm in (2.04, 13.0))
     assert first.words == "tumor_1 has moved by 2.0 mm"
     assert first != second
     assert first.same_as == second.same_as
     assert first.words_without_numbers == second.words_without_numbers
-    for other in (moved("kidney", 2.04), moved("tumor_1", 2.04, cut=True), Halt("planning")):
+    cut = msgspec.structs.replace(first, cut=True)
+    assert CUT_NOTE in cut.words
+    for other in (Halt("moved", {"part": "kidney", "off_mm": 2.04}), cut, Halt("planning")):
         assert other.same_as != first.same_as
-    assert CUT_NOTE in moved("tumor_1", 2.04, cut=True).words
-    assert without_frame(0.6).same_as == without_frame(1.9).same_as
-    assert without_frame(0.6).words == "no estimate: no frame for 0.6 s"
+    once, again = (
+        Halt("no_estimate", {"words": finding.words}, finding)
+        for finding in (Finding("no_frame", {"seconds": s}) for s in (0.6, 1.9))
+    )
+    assert once.same_as == again.same_as
+    assert once.words == "no estimate: no frame for 0.6 s"
 
 
 def test_every_kind_has_one_sentence():
-    assert {*halt._SENTENCES} == {*get_args(halt.HaltKind)}
-    assert sorted([*report._SAID.poor, *report._SAID.none, *report._SAID.case]) == sorted(
-        get_args(report.Kind)
+    halts, findings = (
+        tomllib.loads(files("tumortrack.core").joinpath(name).read_text("utf-8"))
+        for name in ("halts.toml", "findings.toml")
     )
+    assert set(halts) == set(get_args(HaltKind))
+    assert sorted(kind for part in findings.values() for kind in part) == sorted(get_args(Kind))

@@ -10,7 +10,6 @@ from importlib import import_module
 import pytest
 
 from clock import until
-from tumortrack.core import process
 from tumortrack.core.process import interrupt_between_imports, undisturbed
 
 GREEDY = """
@@ -45,22 +44,10 @@ def test_an_import_may_end_and_the_interrupt_is_not_lost(greedy):
     assert import_module(greedy).whole
 
 
-def test_it_waits_for_long_only_for_those_that_are_known_to_catch_all(greedy, monkeypatch):
+def test_what_imports_for_long_is_interrupted_after_all(greedy):
     interrupt_between_imports(retries=0)
     assert not import_module(greedy).whole
     sys.modules.pop(greedy)
-    monkeypatch.setattr(process, "_CATCHING_ALL", {greedy})
-    with pytest.raises(KeyboardInterrupt):
-        until(lambda: not import_module(greedy).whole, "the interrupt")
-    assert import_module(greedy).whole
-
-
-def test_whoever_handles_it_when_the_import_has_ended_gets_it(greedy):
-    interrupt_between_imports()
-    came = []
-    import_module(greedy)
-    signal.signal(signal.SIGINT, lambda *_: came.append(1))  # as `track` does
-    until(lambda: came, "the interrupt")
 
 
 def test_it_waits_for_work_that_must_not_be_disturbed(greedy):
@@ -77,13 +64,10 @@ def test_it_waits_for_work_that_must_not_be_disturbed(greedy):
     assert done
 
 
-def test_elsewhere_it_comes_at_once(greedy):
+def test_outside_imports_it_comes_at_once_or_stays_ignored(greedy):
     interrupt_between_imports()
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGINT)
-
-
-def test_what_is_ignored_stays_so(greedy):
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     interrupt_between_imports()
     assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN

@@ -35,7 +35,7 @@ def test_terms_are_known_by_name_stated_or_an_organs():
     assert Organ(name="phantom").snomed == ("113343008", "Organ")
     assert Organ(name="appendix", term=("66754008", "Appendix")).snomed[1] == "Appendix"
     for term in (("liver", "Liver"), ("10200004", "a^b")):
-        with pytest.raises(InputError, match="SNOMED"):
+        with pytest.raises(InputError, match=term[0]):
             Organ(name="liver", term=term)
     organ, tumor = segments(("liver", "tumor_1"), organ=LIVER)
     assert "SCT^10200004^Liver" in organ.terminology
@@ -44,7 +44,7 @@ def test_terms_are_known_by_name_stated_or_an_organs():
 
 
 def test_sides_are_asked_for_only_of_what_has_them():
-    with pytest.raises(InputError, match="one liver only"):
+    with pytest.raises(InputError, match="liver"):
         PrepareOptions(name="liver", side="left")
     PrepareOptions(name="lung", side="left")
     named = Patient("P1")
@@ -73,7 +73,7 @@ def test_a_case_that_names_no_organ_or_a_strange_one_is_refused(tmp_path):
     manifest = json.loads(path.read_text())
     del manifest["organ"]
     path.write_text(json.dumps(manifest))
-    with pytest.raises(ArtifactError, match=r"`organ`.*Make one with `tumortrack prepare`"):
+    with pytest.raises(ArtifactError, match="prepare"):
         load_case(tmp_path)
     path.write_text(json.dumps({**manifest, "organ": {"name": "../../x"}}))
     with pytest.raises(ArtifactError, match="--name"):
@@ -119,6 +119,6 @@ def test_the_organ_is_found_among_files(tmp_path):
         (tmp_path / f"{name}.ply").touch()
     assert organ_of_folder(tmp_path, {}).name == "spleen"
     (tmp_path / "liver.ply").touch()
-    with pytest.raises(InputError, match=r"name it in meta\.json"):
+    with pytest.raises(InputError, match=r"meta\.json"):
         organ_of_folder(tmp_path, {})
     assert organ_of_folder(tmp_path, {"organ": {"name": "liver"}}) == LIVER

@@ -2,7 +2,6 @@
 
 import math
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -11,10 +10,15 @@ from render_objects import anatomy
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
-from tumortrack.sense import kernels
 from tumortrack.sense.clutter import ClutterConfig
+from tumortrack.sense.kernels import seen_pixels
 from tumortrack.sense.noise import D405_NOISE, CalibrationConfig, miscalibrate
-from tumortrack.sense.occlusion import OcclusionConfig, occlude
+from tumortrack.sense.occlusion import (
+    OcclusionConfig,
+    occlude,
+    order_shaft,
+    take_first,
+)
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
 
 HIDING = OcclusionConfig(scenes=1.0, largest_share=0.6)
@@ -47,15 +51,15 @@ def test_what_is_hidden_has_no_return_and_the_rest_is_as_it_was():
 def test_the_first_in_order_are_taken_up_to_a_count():
     order, taken = np.random.default_rng(0).random(20_000, np.float32), np.zeros(20_000, bool)
     taken[:100] = True
-    got = kernels.take_first(order, taken, 7000)
+    got = take_first(order, taken, 7000)
     assert got == taken[100:].sum()
     assert 7000 - 40 <= got <= 7000  # short of it by less than one of 1024 bins
     assert order[100:][taken[100:]].max() <= order[100:][~taken[100:]].min()
     few = np.full(50, np.inf, np.float32)
     few[:3] = 1.0
-    assert kernels.take_first(few, np.zeros(50, bool), 10) == 3
-    assert kernels.take_first(few, np.zeros(50, bool), 2) == 0  # equal ones go together
-    assert kernels.take_first(np.full(5, np.inf, np.float32), np.zeros(5, bool), 2) == 0
+    assert take_first(few, np.zeros(50, bool), 10) == 3
+    assert take_first(few, np.zeros(50, bool), 2) == 0  # equal ones go together
+    assert take_first(np.full(5, np.inf, np.float32), np.zeros(5, bool), 2) == 0
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -63,9 +67,9 @@ def test_a_shaft_is_as_wide_as_asked_and_ends_at_its_tip(seed):
     rng = np.random.default_rng(seed)
     angle = rng.uniform(0, 2 * np.pi)
     towards = np.array([np.cos(angle), np.sin(angle)])
-    rows, columns = np.divmod(kernels.seen_pixels(dome().depth_mm).pixels, dome().intrinsics.width)
+    rows, columns = np.divmod(seen_pixels(dome().depth_mm).pixels, dome().intrinsics.width)
     tip = np.array([SMALL.cx, SMALL.cy])
-    order = kernels.order_shaft(columns, rows, tip, towards, 7.0, 0.0)
+    order = order_shaft(columns, rows, tip, towards, 7.0, 0.0)
     inside = np.isfinite(order)
     offset = np.stack([columns, rows], axis=1) - tip
     along, across = offset @ towards, np.abs(offset @ [-towards[1], towards[0]])
@@ -74,22 +78,6 @@ def test_a_shaft_is_as_wide_as_asked_and_ends_at_its_tip(seed):
     assert inside[(along > 0) & (across < 6.99)].all()
     assert not inside[(along < 0) & (np.hypot(along, across) > 7.01)].any()
     np.testing.assert_allclose(order[inside], -along[inside], atol=1e-4)  # outermost first
-
-
-def test_hidden_regions_come_from_the_border_in_most_images():
-    """Shafts and patches enter from outside: a hidden pixel touches what had no return before."""
-    from scipy.ndimage import binary_dilation, label
-
-    entered = []
-    for seed in range(80):
-        before, _, lost = hidden(seed)
-        regions, count = label(lost)
-        rim = binary_dilation(np.isnan(before)) & lost
-        if lost.sum() > 200:
-            touching = np.isin(regions, np.unique(regions[rim])) & lost
-            entered.append(touching.sum() / lost.sum())
-        assert count <= 8
-    assert np.mean(np.array(entered) > 0.9) > 0.9
 
 
 def test_what_is_left_in_lies_before_the_organ():
@@ -128,24 +116,19 @@ def test_occlusion_draws_nothing_when_off_and_leaves_the_generator_alone():
     assert not np.array_equal(hidden(1)[2], hidden(2)[2])
 
 
-def test_limits_and_json():
-    config = OcclusionConfig(scenes=0.5, largest_share=0.6, left_in=0.2, shaft_mm=(4.0, 8.0))
-    assert from_builtins(to_builtins(config), OcclusionConfig, "here") == config
-    for bad in (
-        {"scenes": 1.1},
-        {"largest_share": 0.95},
-        {"left_in": math.nan},
-        {"shaft_mm": (0.0, 3.0)},
-        {"nearer_mm": (9.0, 5.0)},
-    ):
-        with pytest.raises(InputError, match="occlusion"):
-            OcclusionConfig(**bad)
-    for bad in ({"offset_mm": -1.0}, {"scale": 0.5}, {"offset_mm": math.inf}):
-        with pytest.raises(InputError, match="calibration"):
-            CalibrationConfig(**bad)
-    for bad in ((100, 500), (900, 500)):
-        with pytest.raises(InputError, match="cloud_points"):
-            SceneConfig(cloud_points=bad)
+@pytest.mark.parametrize(
+    ("kind", "wrong"),
+    [
+        *((OcclusionConfig, {"scenes": 1.1}), (OcclusionConfig, {"largest_share": 0.95})),
+        *((OcclusionConfig, {"left_in": math.nan}), (OcclusionConfig, {"shaft_mm": (0.0, 3.0)})),
+        *((OcclusionConfig, {"nearer_mm": (9.0, 5.0)}), (CalibrationConfig, {"offset_mm": -1.0})),
+        *((CalibrationConfig, {"scale": 0.5}), (CalibrationConfig, {"offset_mm": math.inf})),
+        *((SceneConfig, {"cloud_points": (100, 500)}), (SceneConfig, {"cloud_points": (900, 500)})),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name(kind, wrong):
+    with pytest.raises(InputError, match=next(iter(wrong))):
+        kind(**wrong)
 
 
 def test_a_camera_out_of_calibration_errs_alike_everywhere():
@@ -175,31 +158,6 @@ def recipe(index):
     return SceneRecipe(5, "train", index)
 
 
-def test_hidden_scenes_lie_where_they_lay_and_their_clouds_lose_points():
-    plain = SceneConfig()
-    on = msgspec.structs.replace(plain, occlusion=HIDING)
-    one, two = (Simulator(ANATOMY, UP, config) for config in (plain, on))
-    lost = 0
-    for index in range(8):
-        before, after = one.render(recipe(index)), two.render(recipe(index))
-        np.testing.assert_array_equal(before.camera_from_ct, after.camera_from_ct)
-        kept = np.isfinite(after.frame.depth_mm)
-        np.testing.assert_array_equal(after.frame.depth_mm[kept], before.frame.depth_mm[kept])
-        lost += np.isfinite(before.frame.depth_mm).sum() - kept.sum()
-        again = two.render(recipe(index))
-        np.testing.assert_array_equal(after.cloud.points_mm, again.cloud.points_mm)
-    assert lost > 5000
-
-
-def test_clouds_have_a_random_number_of_points():
-    config = SceneConfig(cloud_points=(300, 3000), free_range=0.5)
-    simulator = Simulator(ANATOMY, UP, config)
-    counts = np.array([len(simulator.render(recipe(i)).cloud.points_mm) for i in range(60)])
-    assert counts.min() >= 300
-    assert counts.max() <= 3000
-    assert 15 < (counts < math.sqrt(300 * 3000)).sum() < 45  # even on a logarithmic scale
-
-
 def test_everything_at_once_replays():
     config = SceneConfig(
         clutter=ClutterConfig(scenes=1.0, largest_share=0.05),
@@ -215,4 +173,4 @@ def test_everything_at_once_replays():
     for index in (2, 0, 1):
         first, second = one.render(recipe(index)), two.render(recipe(index))
         np.testing.assert_array_equal(first.cloud.points_mm, second.cloud.points_mm)
-        assert len(first.cloud.points_mm) >= 200
+        assert 200 <= len(first.cloud.points_mm) <= 5000

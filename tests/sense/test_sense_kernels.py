@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from depth_objects import dome
 from tumortrack.core.types import SensorCloud
 from tumortrack.sense import kernels
 from tumortrack.sense.camera import Pinhole
 from tumortrack.sense.region import choose, pieces, plane, working_image
-from tumortrack.sense.region.working_image import LAST_BOX, PLANE, RANGE, WorkingImage
+from tumortrack.sense.region.working_image import LAST_BOX, RANGE, WorkingImage
 from tumortrack.sense.smoothing import _smooth_depth
 
 CAMERA = Pinhole(50.0, 52.0, 14.3, 9.8)
@@ -49,23 +48,10 @@ def test_noise_is_hashed_by_splitmix():
 def test_a_list_of_another_image_reaches_nowhere_outside():
     wide, small = kernels.seen_pixels(np.zeros((6, 9), np.float32)), np.zeros((4, 5), np.float32)
     depths_mm = np.zeros(54, np.float32)
-    kernels.lose_grazing(small, depths_mm, wide, 3, (1.0, 0.0), CAMERA)
-    kernels.fly(small, depths_mm, wide, 3, kernels.Flying(1.0, 5.0, 10**18, 0.0))
+    kernels.lose_grazing(small, depths_mm, wide, 3, 1.0, 1.0, CAMERA, np.zeros(5))
+    kernels.fly(small, depths_mm, wide, 3, (1.0, 5.0, 10**18, 0.0))
     assert (depths_mm[5:9] == 0).all()
     assert np.isfinite(kernels.smooth_at(wide, (4, 5), 3, 0)[:5]).all()
-
-
-@pytest.mark.parametrize("blob", [True, False])
-def test_a_patch_grows_by_its_distance_and_waves(blob):
-    rng = np.random.default_rng(2)
-    rows, columns = np.divmod(kernels.seen_pixels(dome().depth_mm).pixels, dome().intrinsics.width)
-    start, axes, waves = np.array([90.0, 40.0]), rng.normal(0, 0.01, (2, 2)), rng.random((2, 3, 3))
-    x, y = axes @ (np.stack([columns, rows]) - start[:, None])
-    expected = np.hypot(x, y) if blob else x
-    for places, of in zip((columns, rows), waves, strict=True):
-        expected = expected + sum(c * np.cos(a * places + b) for a, b, c in of)
-    order = kernels.order_patch(columns, rows, start, axes, blob, waves)
-    np.testing.assert_allclose(order, expected, atol=1e-6)
 
 
 def test_smoothing_is_the_plane_through_its_neighbours():
@@ -161,17 +147,6 @@ def test_the_best_plane_has_the_best_score():
     np.testing.assert_allclose([*found, *offset], expected, rtol=1e-4)
     none = plane._consensus(points, triples[:, [0, 0, 0]].copy(), (3.0, 60.0), found, offset)
     assert none == -np.inf
-
-
-def test_below_a_plane_is_by_height():
-    image = rough()
-    v, u = np.indices(image.depth_mm.shape)
-    right, down = np.linspace(-0.1, 0.1, 31), np.linspace(0.9, 1.1, 24)
-    low = image.depth_mm * (right[u] + down[v]) - 118 < 2.5
-    expected = np.where((image.taken == 0) & low, PLANE, image.taken)
-    plane._remove_below(image.depth_mm, image.taken, right, down, 118.0, 2.5, PLANE)
-    np.testing.assert_array_equal(image.taken, expected)
-    assert 0.1 < (expected == PLANE).mean() < 0.9
 
 
 def test_pixels_with_few_neighbours_are_isolated():

@@ -12,20 +12,13 @@ from noise_objects import seen
 from stories import succeeded, tumortrack
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, Intrinsics
-from tumortrack.sense.measured_noise import depth_step_mm, image_noise
+from tumortrack.sense.measured_noise import depth_step_mm
 from tumortrack.sense.noise import D405_NOISE, STEREO_NOISE, add_noise
 from tumortrack.sense.sensors import FIGURES, depth_error_of, simulated
 from tumortrack.simulate.scene_folder import read_scene
 from tumortrack.tracking.options import LocateOptions, SimulatedSensor, SimulateOptions
 
 FLIGHT = [name for name in FIGURES if "flying_share" in FIGURES[name]]
-# Sensor and distance, where it sees so near; of an endoscope nothing is published beyond 150 mm.
-SEEN = [
-    (name, distance_mm)
-    for name in FIGURES
-    for distance_mm in (150.0, 300.0, 500.0)
-    if distance_mm >= simulated(name).nearest_mm and (name != "endoscope" or distance_mm == 150)
-]
 
 
 def flat(distance_mm: float, width: int = 848) -> DepthFrame:
@@ -50,33 +43,6 @@ def step_mm(config, depth_mm: float) -> float:
 
 def test_options_offer_what_the_table_has():
     assert set(get_args(SimulatedSensor)) == {"d405", "stereo", *FIGURES}
-
-
-@pytest.mark.parametrize(("name", "distance_mm"), SEEN)
-def test_errors_are_as_large_as_stated(name, distance_mm):
-    """Over ten units, whose frozen parts differ: within 3 %, as a long correlation leaves few
-    independent places."""
-    config, true = without_steps(name), flat(distance_mm)
-    errors = [frame_of(replace(config, unit=n), true, n) - distance_mm for n in range(10)]
-    expected = np.hypot(*config.noise_mm(distance_mm))
-    assert np.sqrt(np.nanmean(np.square(errors))) == pytest.approx(expected, rel=0.03)
-
-
-@pytest.mark.parametrize(("name", "distance_mm"), SEEN)
-def test_measured_noise_finds_it_in_one_frame(name, distance_mm):
-    """Within 20 %, where the correlation is shorter than a quarter of the 12 mm that the measure
-    looks at; longer noise looks like shape, so of it no more than what is there is found."""
-    config, true = simulated(name), seen(848, distance_mm)
-    found = image_noise(add_noise(true, config, np.random.default_rng(0)))
-    stated = np.hypot(*config.noise_mm(found.depth_mm))
-    zoom = 848 / config.native_px
-    length_mm = config.temporal_length_px * zoom * found.depth_mm / true.intrinsics.fx
-    if found.bound:
-        assert found.whole_mm == pytest.approx(step_mm(config, found.depth_mm) / 2)
-    elif length_mm < 3:
-        assert found.whole_mm == pytest.approx(stated, rel=0.2)
-    else:
-        assert found.whole_mm < 1.1 * stated
 
 
 @pytest.mark.parametrize("width", [848, 424])
@@ -270,7 +236,7 @@ def test_a_cameras_error_is_stated_in_mm_or_by_its_kind():
     assert depth_error_of("d405-measured") == (5.0, 0.02)
     assert depth_error_of("azure-kinect") == (25.0, 0.001)  # 10, and 15 of tissue
     for wrong in ("-1", "30", "nan", "d999"):
-        with pytest.raises(InputError, match=r"0 to 20.*d435"):
+        with pytest.raises(InputError, match=wrong):
             depth_error_of(wrong)
 
 

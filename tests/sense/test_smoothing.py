@@ -27,11 +27,6 @@ def test_what_is_left_is_as_of_so_many_pixels(white_mm):
     assert noise.of_points(1, reach).point_mm == pytest.approx(expected_mm, rel=0.25)
 
 
-def test_little_noise_is_left_as_it_is():
-    frame = noisy(seen(424, 150), 0.2)
-    assert window_px(frame, image_noise(frame)) == 0
-
-
 def test_nothing_is_averaged_across_a_step():
     """The organ's edge before the table, 40 mm behind."""
     true = seen(424, 150)

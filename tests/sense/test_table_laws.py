@@ -159,34 +159,28 @@ def test_an_outline_of_one_piece_and_touches_of_their_own(tmp_path):
 def test_points_that_were_never_placed_are_left_out_and_counted(tmp_path):
     path = tmp_path / "Slicer.csv"
     path.write_text(
-        "label,r,a,s,defined,selected\nA,1,2,3,1,1\nB,0,0,0,0,1\nC,4,5,6,1,1\nD,0,0,0,0,1\n"
+        "label,r,a,s,defined,selected\nA,1,2,3,1,1\nB,0,0,0,False,1\nC,4,5,6,1,1\nD,0,0,0,no,1\n"
+        "E,0,0,0,0.0,1\nF,0,0,0,0,1\n"
     )
     table = read_points(path)
     assert table.points_ct.tolist() == [[-1, -2, 3], [-4, -5, 6]]
     assert [row[0] for row in table.rows] == ["A", "C"]
     (note,) = table.notes
-    assert "2 of 4" in note
+    assert "4 of 6" in note
     path.write_text("label,r,a,s,defined\nB,0,0,0,0\n")
     with pytest.raises(InputError):
         read_points(path)
 
 
-@pytest.mark.parametrize("text", ["0", "0.0", "False", "no"])
-def test_that_a_point_has_no_place_is_said_in_many_ways(text, tmp_path):
-    path = tmp_path / "points.csv"
-    path.write_text(f"label,r,a,s,defined\nA,1,2,3,1\nB,0,0,0,{text}\n")
-    assert len(read_points(path).points_ct) == 1
-
-
 def test_evidence_that_is_none_and_a_tiff_of_several_images_are_refused(tmp_path):
     path = tmp_path / "e.json"
     path.write_text('{"frame": "camera", "unit": "mm", "evidence": []}')
-    with pytest.raises(InputError, match="no evidence"):
+    with pytest.raises(InputError, match=r"e\.json"):
         read_evidence(path)
     images = [Image.fromarray(DEPTHS.astype(np.uint16)) for _ in range(2)]
     images[0].save(tmp_path / "d.tif", save_all=True, append_images=images[1:])
     write_intrinsics(tmp_path / "i.json", CAMERA)
-    with pytest.raises(InputError, match="2 images"):
+    with pytest.raises(InputError, match=r"d\.tif"):
         read_depth(tmp_path / "d.tif", tmp_path / "i.json")
 
 
@@ -194,7 +188,7 @@ def test_evidence_that_is_none_and_a_tiff_of_several_images_are_refused(tmp_path
 def test_a_key_twice_is_refused(read, tmp_path):
     path = tmp_path / "f.json"
     path.write_text('{"frame_id": "a", "unit": "mm", "deep": [{"unit": "m", "unit": "mm"}]}')
-    with pytest.raises(InputError, match="'unit' twice"):
+    with pytest.raises(InputError, match="'unit'"):
         read(path)
 
 
@@ -225,8 +219,6 @@ STORED += [(".npy", kind) for kind in SENTINELS]
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(("suffix", "kind"), STORED)
 def test_what_stands_for_no_depth_counts_as_none(suffix, kind, tmp_path):
-    from PIL import Image
-
     raw = DEPTHS.astype(kind)
     raw[1] = np.resize(SENTINELS[kind], 4)
     path, camera = tmp_path / f"d{suffix}", tmp_path / "c.json"
@@ -297,16 +289,6 @@ def test_an_array_is_a_cloud_or_with_a_camera_a_depth_image(tmp_path):
         read_cloud(path)
 
 
-@pytest.mark.parametrize("fill", [np.nan, np.inf, 0.0, np.finfo(np.float32).max])
-def test_points_without_return_are_dropped_and_counted(fill, tmp_path):
-    points = np.full((10, 3), 100.0, np.float32)
-    points[::2] = fill
-    np.save(tmp_path / "a.npy", points)
-    cloud, (note,) = read_cloud(tmp_path / "a.npy")
-    assert len(cloud.points_mm) == 5
-    assert "5 of 10" in note
-
-
 def test_a_depth_scale_that_is_a_unit_names_file_and_unit(tmp_path):
     path = tmp_path / "c.json"
     write_intrinsics(path, CAMERA)
@@ -373,17 +355,15 @@ def test_what_easy_handeye_writes_is_read(style, moves, tmp_path):
     with pytest.raises(InputError):
         read_frames(path, not moves)
     text = path.read_text()
-    wrong = {
-        "no number": text.replace("0.5", "far"),
-        "no quaternion": text.replace("1.0", "1.1").replace("qx: 1,", "qx: 2,"),
-        "no z": text.replace("z: 0.9", "").replace("z: 9.0e-1", ""),
-        "a comment": text + "# x: 0.4, y: far\n",
-        "two bases": text + "robot_base_frame: other\n",
-        "mm": text.replace("0.5", "500"),
-    }
-    path.write_text(wrong.pop("a comment"))
+    path.write_text(text + "# x: 0.4, y: far\n")
     np.testing.assert_allclose(read_frames(path, moves).published_from_camera, half_turn)
-    for name, told in wrong.items():
+    for told in (
+        text.replace("0.5", "far"),
+        text.replace("1.0", "1.1").replace("qx: 1,", "qx: 2,"),  # no rotation
+        text.replace("z: 0.9", "").replace("z: 9.0e-1", ""),
+        text + "robot_base_frame: other\n",
+        text.replace("0.5", "500"),  # mm
+    ):
         path.write_text(told)
         with pytest.raises(InputError):
-            pytest.fail(f"{name}: {read_frames(path, moves)}")
+            read_frames(path, moves)

@@ -3,7 +3,7 @@ depth alone cannot tell the organ from its surroundings."""
 
 from __future__ import annotations
 
-import os
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -52,9 +52,8 @@ def find(frame, picture, taught):
 def test_colour_parts_what_is_one_thing_to_depth():
     frame, picture, on = two_tissues()
     u, _ = pixels(SMALL)
-    assert (organ_points(frame, CONFIG, Hints(), np.random.default_rng(0)).taken == 0)[
-        on
-    ].mean() > 0.9
+    alone = organ_points(frame, CONFIG, Hints(), np.random.default_rng(0))
+    assert (alone.taken == 0)[on].mean() > 0.9
     taught = teach(clicks_of(frame, picture))
     assert taught.right == 1
     region = find(frame, picture, taught)
@@ -71,13 +70,13 @@ def test_colour_parts_what_is_one_thing_to_depth():
     assert cloud.points_mm[:, 0].max() < 2
 
 
-def test_the_order_of_clicks_and_repetition_change_nothing():
+def test_the_order_of_clicks_changes_nothing():
     frame, picture, _ = two_tissues()
     clicks = clicks_of(frame, picture)
-    taught, other = teach(clicks), teach([clicks[k] for k in (5, 0, 3, 6, 1, 4, 2)])
-    assert np.array_equal(taught.centres, other.centres)
-    assert np.array_equal(taught.whiten, other.whiten)
-    first, second = (find(frame, picture, each) for each in (taught, other))
+    first, second = (
+        find(frame, picture, taught)
+        for taught in (teach(clicks), teach([clicks[k] for k in (5, 0, 3, 6, 1, 4, 2)]))
+    )
     assert np.array_equal(first.taken, second.taken)
     assert np.array_equal(first.cloud.points_mm, second.cloud.points_mm)
 
@@ -93,27 +92,21 @@ def test_exposure_and_shading_change_hardly_a_pixel():
         assert changed.sum() < 0.02 * on.sum()
 
 
-def test_it_says_when_it_does_not_know():
+def test_clicks_that_do_not_tell_are_refused():
     frame, picture, _ = two_tissues()
     clicks = clicks_of(frame, picture)
-    with pytest.raises(InputError, match="click 2 more on what is not the organ"):
-        teach(clicks[:3])
-    with pytest.raises(InputError, match="1 more on what is the organ and 2 more on what is not"):
-        teach(clicks[:1])
-    frame, same, _ = two_tissues(RED)
-    with pytest.raises(InputError, match="look alike"):
-        teach(clicks_of(frame, same))
+    _, same, _ = two_tissues(RED)
     mixed = [replace(click, organ=k % 2 == 0) for k, click in enumerate(clicks)]
-    with pytest.raises(InputError, match="look alike"):
-        teach(mixed)
-    for pixel, painted_white in (((0, 0), False), ((120, 150), True)):
-        shown = np.full_like(picture, 255) if painted_white else picture
-        depth_mm = frame.depth_mm.copy()
-        depth_mm[:20, :20] = np.nan
-        with pytest.raises(InputError, match="too little is seen there"):
-            sample_click(DepthFrame(depth_mm, SMALL), shown, pixel, True)
-    with pytest.raises(InputError, match="the picture is 424 x 239"):
-        sample_click(frame, picture[1:], (3, 3), True)
+    for wrong in (clicks[:3], clicks[:1], clicks_of(frame, same), mixed):
+        with pytest.raises(InputError):
+            teach(wrong)
+    depth_mm = frame.depth_mm.copy()
+    depth_mm[:20, :20] = np.nan
+    holed = DepthFrame(depth_mm, SMALL)
+    white = np.full_like(picture, 255)
+    for shown, pixel in ((picture, (0, 0)), (white, (120, 150)), (picture[1:], (3, 3))):
+        with pytest.raises(InputError):
+            sample_click(holed, shown, pixel, True)
 
 
 def test_where_it_cannot_be_used_depth_decides_and_it_is_said():
@@ -124,26 +117,19 @@ def test_where_it_cannot_be_used_depth_decides_and_it_is_said():
         np.clip(picture * gain, 0, 255).astype(np.uint8) for gain in ([0.3, 0.7, 2], 0.02)
     )
     grey = np.repeat(picture.mean(-1, keepdims=True).astype(np.uint8), 3, axis=2)
-    for other, why in (
-        *((None, "no picture"), (blue, "another light"), (dark, "another light")),
-        (grey, "another light"),
-    ):
+    for other in (None, blue, dark, grey):
         region = find(frame, other, taught)
-        assert why in region.doubt
+        assert region.doubt
         assert np.array_equal(region.taken, alone.taken)
-    cloud = SensorCloud(deproject(frame))
-    assert "no picture" in find(cloud, picture, taught).doubt
-    with pytest.raises(NoEstimate, match="another light"):
+    assert find(SensorCloud(deproject(frame)), picture, taught).doubt
+    with pytest.raises(NoEstimate):
         tt.find_organ(frame, range_mm=(60, 400), picture=blue, taught=taught)
-    empty = DepthFrame(np.full((240, 424), np.nan), SMALL)
-    with pytest.raises(NoEstimate, match="Also, what the clicks taught is not used"):
-        find(empty, picture, taught)
 
 
 def test_grey_pictures_teach_only_large_differences():
     frame, picture, on = two_tissues()
     grey = picture.mean(-1).astype(np.uint8)
-    with pytest.raises(InputError, match="look alike"):
+    with pytest.raises(InputError):
         teach(clicks_of(frame, grey))
     u, _ = pixels(SMALL)
     grey[~on | (u > 212)] = 14 + grey[~on | (u > 212)] // 20
@@ -153,24 +139,16 @@ def test_grey_pictures_teach_only_large_differences():
     assert organ[on & (u > 219)].mean() < 0.05
 
 
-# Eight random kidneys, lights, colours and colour noise; fat against a third to a half of the
-# organ, flush with it; with a hand and a shaft; a hand alone; fat of the organ's own colour. Three
-# clicks on the organ, five beside it, in turn on each thing that there is.
+# Random kidneys, lights, colours and noise; fat against a third to a half of the organ, flush
+# with it; with a hand and a shaft; a hand alone. Three clicks on the organ, five beside it, in turn
+# on each thing that there is. Least mean precision and recall, and share of good scenes.
 NEAR = replace(DRAPED, distance_mm=(110.0, 220.0))
 KINDS = {
-    "fat": replace(NEAR, fat=True),
-    "fat, hand, shaft": replace(NEAR, fat=True, hand=True, shafts=1),
-    "hand, shaft": replace(NEAR, hand=True, shafts=1),
-    "fat of its colour": replace(NEAR, fat=True),
+    "fat": (replace(NEAR, fat=True), 0.95, 0.85, 0.85),
+    "fat, hand, shaft": (replace(NEAR, fat=True, hand=True, shafts=1), 0.9, 0.75, 0.75),
+    "hand, shaft": (replace(NEAR, hand=True, shafts=1), 0.94, 0.75, 0.85),
 }
-# Least mean precision and recall, and good scenes of all, with the clicks.
-LEAST = {
-    "fat": (0.95, 0.85, 0.85),
-    "fat, hand, shaft": (0.9, 0.75, 0.75),
-    "hand, shaft": (0.94, 0.75, 0.85),
-    "fat of its colour": (0.0, 0.0, 0.0),
-}
-SCENES = int(os.environ.get("TAUGHT_SCENES", "6"))
+SCENES = 6
 
 
 @pytest.fixture(scope="module")
@@ -181,61 +159,48 @@ def kidneys():
 def clicked(scene, picture, rng):
     """As a user does it: where a click shows too little, somewhere else."""
     clicks = []
-    for organ, count in ((True, 3), (False, 5)):
-        left = count
-        for pixel in clicks_on(scene, organ, 4 * count, rng):
+    for organ, left in ((True, 3), (False, 5)):
+        for pixel in clicks_on(scene, organ, 4 * left, rng):
             if left:
-                try:
+                with suppress(InputError):
                     clicks.append(sample_click(scene.frame, picture, pixel, organ))
                     left -= 1
-                except InputError:
-                    pass
     return clicks
 
 
-def with_and_without(kind, kidneys):
-    """Precision and recall without and with clicks (n, 4); how often they were refused or not
-    used."""
-    rows, refused = [], 0
-    for seed in range(SCENES):
-        rng = np.random.default_rng((53, seed))
-        scene = make_scene(kidneys[seed % len(kidneys)], KINDS[kind], rng)
-        colours = random_colours(rng)
-        if kind == "fat of its colour":
-            colours[FAT] = colours[ORGAN] * np.exp(rng.normal(0, 0.02, 3))
-        picture = painted(scene, colours, random_light(rng), rng)
-        regions = [organ_points(scene.frame, CONFIG, Hints(), np.random.default_rng(0))] * 2
-        try:
-            regions[1] = find(scene.frame, picture, teach(clicked(scene, picture, rng)))
-            refused += bool(regions[1].doubt)
-        except InputError:
-            refused += 1
-        rows.append([x for region in regions for x in precision_recall(scene, region.taken)])
-    return np.array(rows), refused
+def scene_with_colours(kidneys, props, seed, same=False):
+    """A scene, its picture, and what clicks on it teach; ``same``: fat of the organ's colour."""
+    rng = np.random.default_rng((53, seed))
+    scene, colours = make_scene(kidneys[seed], props, rng), random_colours(rng)
+    if same:
+        colours[FAT] = colours[ORGAN] * np.exp(rng.normal(0, 0.02, 3))
+    picture = painted(scene, colours, random_light(rng), rng)
+    return scene, picture, clicked(scene, picture, rng)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_clicks_gain_in_scenes(kind, kidneys):
-    """``TAUGHT_SCENES=40 pytest -s`` prints the gain of each kind."""
-    rows, refused = with_and_without(kind, kidneys)
-    good = (rows[:, ::2] > 0.85) & (rows[:, 1::2] > 0.6)
-    means, tenth = 100 * rows.mean(0), 100 * np.quantile(rows, 0.1, axis=0)
-    worst = 100 * rows[rows[:, 2:].prod(1).argmin()]
-    shares = [f"{m:.1f} ({t:.0f})" for m, t in zip(means, tenth, strict=True)]
-    print(
-        f"\n| {kind} | {shares[0]}, {shares[1]} | {good[:, 0].sum()}/{len(rows)} "
-        f"| {shares[2]}, {shares[3]} | {good[:, 1].sum()}/{len(rows)} | {refused} "
-        f"| {worst[2]:.0f}, {worst[3]:.0f} |"
-    )
-    if kind == "fat of its colour":
-        changed = np.abs(rows[:, :2] - rows[:, 2:]).max(1) > 1e-9
-        assert changed.sum() <= len(rows) - refused
-        assert refused >= 0.9 * len(rows)
-        return
-    precision, recall, share = LEAST[kind]
-    assert means[2] > 100 * precision
-    assert means[3] > 100 * recall
-    assert good[:, 1].mean() >= share
+    props, least_precision, least_recall, least_good = KINDS[kind]
+    rows = []
+    for seed in range(SCENES):
+        scene, picture, clicks = scene_with_colours(kidneys, props, seed)
+        regions = [organ_points(scene.frame, CONFIG, Hints(), np.random.default_rng(0))] * 2
+        with suppress(InputError):  # of clicks that look alike
+            regions[1] = find(scene.frame, picture, teach(clicks))
+        rows.append([precision_recall(scene, region.taken) for region in regions])
+    (before, after), means = np.swapaxes(rows, 0, 1), np.mean(rows, axis=0)
+    good = [((part[:, 0] > 0.85) & (part[:, 1] > 0.6)).sum() for part in (before, after)]
+    assert means[1, 0] > least_precision
+    assert means[1, 1] > least_recall
+    assert good[1] >= least_good * SCENES
     if "fat" in kind:
-        assert good[:, 0].mean() < 0.5
-        assert good[:, 1].sum() > good[:, 0].sum()
+        assert good[0] < min(0.5 * SCENES, good[1])
+
+
+def test_fat_of_the_organs_colour_is_told_by_nobody(kidneys):
+    taught = 0
+    for seed in range(SCENES):
+        scene, picture, clicks = scene_with_colours(kidneys, KINDS["fat"][0], seed, same=True)
+        with suppress(InputError):
+            taught += not find(scene.frame, picture, teach(clicks)).doubt
+    assert taught <= 0.1 * SCENES

@@ -9,11 +9,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
 from render_objects import anatomy, sphere
-from tumortrack.core.errors import TumortrackError
 from tumortrack.core.geometry import direction_lps, transform_points
 from tumortrack.simulate.deform.base import View
 from tumortrack.simulate.deform.drag import CONFIGURATIONS, DragConfig, Drags, _centres
-from tumortrack.simulate.scene import PoseConfig, _turn, sample_pose
+from tumortrack.simulate.scene import PoseConfig, sample_pose
 
 ANATOMY = anatomy()
 ORGAN = ANATOMY.organ
@@ -27,13 +26,6 @@ def poses(config, up=ANTERIOR, nearest=(110.0, 125.0), draws=DRAWS, organ=ORGAN)
 
 
 # pose
-
-
-def test_turns_are_scipys():
-    angles = np.random.default_rng(2).uniform(-np.pi, np.pi, (50, 3))
-    ours = np.stack([_turn(*about) for about in angles])
-    theirs = Rotation.from_euler("zyx", angles[:, ::-1]).as_matrix()
-    np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("up", [ANTERIOR, (0.0, 0.0, 1.0), direction_lps("1,-2,0.5")])
@@ -72,17 +64,6 @@ def test_poses_are_rigid_and_honour_distance_and_offset(rotations):
     centre = np.array([(p.min(0) + p.max(0)) / 2 for p in placed])[:, :2]
     assert np.abs(centre).max() <= 12 + 1e-6
     assert kstest(centre.ravel(), "uniform", (-12, 24)).pvalue > 1e-3
-
-
-@pytest.mark.parametrize(
-    ("up", "axis", "end"),
-    [("left", 0, 1), ("right", 0, -1), ("anterior", 1, -1), ("inferior", 2, -1)],
-)
-def test_the_side_that_is_up_lies_nearest_the_camera(up, axis, end):
-    (turn,) = poses(PoseConfig(tilt_deg=0.0), direction_lps(up), (115.0, 115.0), draws=1)
-    depth = transform_points(turn, ORGAN.vertices_mm)[:, 2]
-    assert depth.min() == pytest.approx(115)
-    assert np.argmin(depth) == np.argmax(end * ORGAN.vertices_mm[:, axis])
 
 
 # drag
@@ -169,64 +150,6 @@ def test_drags_start_at_visible_vertices_and_keep_to_their_steps(falloff):
     assert kstest(shares, "uniform").pvalue > 1e-3
     assert kstest(np.array(directions)[:, 2], "uniform", (-1, 2)).pvalue > 1e-3
     assert len(np.unique(starts, axis=0)) > 50
-
-
-def test_nothing_visible_is_an_error():
-    blind = View(ANATOMY, lambda points: np.zeros(len(points), bool))
-    with pytest.raises(TumortrackError, match="none of the organ's vertices"):
-        DragConfig().sample(blind, np.random.default_rng(0))
-
-
-def test_tumors_move_along_with_the_surface():
-    """A tumor 10 mm below the dragged vertex follows by exp(-100 / (2 * 20^2)) of the shift."""
-    tumor = sphere(1.0, (0, -18, 0), 2)
-    drag = one_drag(center=(0, -28, 0), shift=(0, 8, 0), sigma=20.0)
-    moved = (drag.apply(tumor.vertices_mm) - tumor.vertices_mm).mean(0)
-    np.testing.assert_allclose(moved, [0, 8 * np.exp(-1 / 8), 0], atol=0.02)
-
-
-def jacobian_determinants(drag, spread):
-    """By central differences, along the shift's line (where it is least) and about it."""
-    line = np.linspace(-3 * spread, 3 * spread, 601)
-    points = np.concatenate(
-        [
-            line[:, None] * [1.0, 0, 0],
-            np.random.default_rng(0).uniform(-2 * spread, 2 * spread, (2000, 3)),
-        ]
-    )
-    step = 0.05
-    columns = [
-        (drag.apply(points + h) - drag.apply(points - h)) / (2 * step) for h in step * np.eye(3)
-    ]
-    return np.linalg.det(np.stack(columns, axis=2).astype(float))
-
-
-@pytest.mark.parametrize("step", CONFIGURATIONS[3])
-def test_each_drag_of_configuration_3_keeps_space_unfolded(step):
-    distance, sigma, _ = step
-    least = jacobian_determinants(one_drag(shift=(distance, 0, 0), sigma=sigma), sigma).min()
-    assert least == pytest.approx(1 - np.exp(-0.5) * distance / sigma, abs=0.01)
-    assert least > 0.2
-
-
-def test_the_tables_numbers_read_as_variances_fold_space():
-    sigma = np.sqrt(11.7)
-    least = jacobian_determinants(one_drag(shift=(8, 0, 0), sigma=sigma), sigma).min()
-    assert least == pytest.approx(1 - np.exp(-0.5) * 8 / sigma, abs=0.02)
-    assert least < -0.4
-
-
-def test_deformations_record_what_they_did_and_no_drag_does_nothing():
-    drags = DragConfig().sample(VIEW, np.random.default_rng(3))
-    record = drags.record()
-    again = Drags(
-        *(np.array(record[k], np.float32) for k in ("centres_ct", "shifts_mm", "sigmas_mm"))
-    )
-    points = ORGAN.vertices_mm
-    np.testing.assert_array_equal(again.apply(points), drags.apply(points))
-    none = DragConfig(steps=()).sample(VIEW, np.random.default_rng(3))
-    np.testing.assert_array_equal(none.apply(points), points.astype(np.float32))
-    assert none.record() == {"kind": "drag", "centres_ct": [], "shifts_mm": [], "sigmas_mm": []}
 
 
 def test_centres_are_dragged_as_any_point_bit_for_bit():

@@ -4,7 +4,6 @@ a drape, shafts, a hand; with the truth of every pixel."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import trimesh
@@ -70,24 +69,6 @@ class Scene:
     what: np.ndarray
     camera_from_organ: np.ndarray
     kinds: np.ndarray
-
-
-def kidney_of(label_map: Path) -> Mesh:
-    """A patient's kidney with its tumor, straight from the label map."""
-    import nibabel
-    from scipy.ndimage import find_objects, label
-    from skimage.measure import marching_cubes
-
-    image = nibabel.load(label_map)
-    labels = np.asarray(image.dataobj)
-    pieces, _ = label(labels > 0)
-    largest = np.bincount(pieces[labels == 2]).argmax()
-    box = tuple(slice(max(s.start - 2, 0), s.stop + 2) for s in find_objects(pieces)[largest - 1])
-    inside = (pieces[box] == largest).astype(np.float32)
-    spacing = tuple(float(x) for x in image.header.get_zooms())
-    vertices, faces, _, _ = marching_cubes(inside, 0.5, spacing=spacing, step_size=2)
-    mesh = Mesh(vertices, faces)
-    return mesh if mesh.volume_mm3 > 0 else Mesh(vertices, faces[:, ::-1])
 
 
 def make_scene(

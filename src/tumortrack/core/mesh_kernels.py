@@ -48,8 +48,6 @@ def contained(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np
 _WIDE = 8  # boxes in a box, triangles in a leaf, as in nearest_place.c
 _A_THREAD = 20_000  # points that are worth a thread
 
-# How far along a curve through space (Hilbert's) cells below 1024 are
-_along_curve = kernel("along_curve", I64["n", 3], I64["n"].out)
 # Fills leaves and boxes about triangles
 _LEAVES, _BOXES = F64["leaves", 7, _WIDE], F64["boxes", 6, _WIDE]
 _build_tree = kernel("build_tree", (F64["f", 3, 3], _LEAVES.out, _BOXES.out, I64["levels"]))
@@ -60,11 +58,11 @@ _nearest_places = kernel("nearest_places", F64["n", 3], _TREE, F64["n", 3].out)
 
 def nearest_on_faces(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """The nearest place on triangles (f, 3, 3) of each point (n, 3), by a tree of boxes: triangles
-    in the order of a curve through space (Hilbert's), by eights, again and again."""
+    in the order of a curve through space (Morton's), by eights, again and again."""
     middles = triangles.mean(1)
     span = np.maximum(np.ptp(middles, axis=0), 1e-9)
-    keys = np.empty(len(triangles), np.int64)
-    _along_curve((1023 * (middles - middles.min(0)) / span).astype(np.int64, order="C"), keys)
+    cells = (1023 * (middles - middles.min(0)) / span).astype(np.int64)
+    keys = sum((cells[:, n % 3] >> n // 3 & 1) << n for n in range(30))
     sizes = [-(-len(triangles) // _WIDE)]  # of the levels: leaves first, one box last
     while sizes[-1] > 1:
         sizes.append(-(-sizes[-1] // _WIDE))
@@ -83,22 +81,6 @@ def nearest_on_faces(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     parts = np.array_split(points, 1 + len(points) // _A_THREAD)
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return np.concatenate(list(pool.map(nearest, parts)))
-
-
-# Into how many parts the edges of each triangle are cut, and how many triangles there are then
-_cut_edges = kernel("cut_edges", F64["f", 3, 3], float, I64["f"].out, result=int)
-# Their middles and areas
-_spread = kernel("spread", F64["f", 3, 3].any_value, I64["f"], F64["n", 3].out, F64["n"].out)
-
-
-def spread(triangles: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points on triangles (f, 3, 3), and each one's area: see ``mesh_query.surface_samples``."""
-    triangles = np.ascontiguousarray(triangles)
-    cuts = np.empty(len(triangles), np.int64)
-    count = _cut_edges(triangles, spacing, cuts)
-    points, areas = np.empty((count, 3)), np.empty(count)
-    _spread(triangles, cuts, points, areas)
-    return points, areas
 
 
 _farthest = kernel(

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Float32, Float64, UInt8
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points, triangles_of, turned_by
-from tumortrack.core.mesh_kernels import contained, nearest_on_faces, spread
+from tumortrack.core.mesh_kernels import contained, nearest_on_faces
 from tumortrack.core.types import Anatomy, Mesh
 
 _WITHIN_MM = 0.1  # of ``surface_distance``
@@ -44,7 +44,23 @@ def surface_samples(
     Deterministic: every triangle is cut into n^2 equal ones with edges <= spacing, whose centroids
     carry the area. The vertices follow with area 0, so that extremes are included.
     """
-    points, areas = spread(mesh.vertices_mm[mesh.faces], spacing_mm)
+    corners = mesh.vertices_mm[mesh.faces]
+    edges_mm = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    cuts = np.ceil(edges_mm.max(1) / spacing_mm).clip(1, 2**20).astype(int)  # of each edge
+    ends = np.cumsum(cuts**2)
+    points = np.empty((sum(ends[-1:]), 3))
+    for n in np.unique(cuts):
+        chosen = np.flatnonzero(cuts == n)
+        row = np.repeat(np.arange(n), 2 * np.arange(n) + 1)
+        place = np.arange(n * n) - row**2  # in the row; triangles point up and down in turn
+        third = np.where(place % 2, 2 / 3, 1 / 3)
+        u, v = (row - (place + 1) // 2 + third) / n, (place // 2 + third) / n
+        p, q, r = corners[chosen].swapaxes(0, 1)[:, :, None]
+        points[ends[chosen, None] - n * n + np.arange(n * n)] = (
+            p + u[:, None] * (q - p) + v[:, None] * (r - p)
+        )
+    doubled = np.linalg.norm(triangles_of(mesh.vertices_mm, mesh.faces)[1], axis=1)
+    areas = np.repeat(doubled / 2 / cuts**2, cuts**2)
     used = np.unique(mesh.faces)
     points = np.concatenate([points, mesh.vertices_mm[used]])
     return points, np.append(areas, np.zeros(len(used)))

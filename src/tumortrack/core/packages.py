@@ -5,15 +5,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-_CHECKOUT = Path(__file__).parents[3]
+CHECKOUT = Path(__file__).parents[3]
 
 
-def to_install(package: str) -> str:
+def to_install(package: str, checkout: Path = CHECKOUT) -> str:
     """The command that installs a package, also with an extra in brackets."""
     name, bracket, extra = package.partition("[")
     if not name.startswith("tumortrack"):
         return f"pip install '{package}'"
-    folder = _CHECKOUT / name.removeprefix("tumortrack").removeprefix("-")
+    folder = checkout / name.removeprefix("tumortrack").removeprefix("-")
     if (folder / "pyproject.toml").is_file():
         return f"pip install -e '{folder}{bracket}{extra}'"
     return f"pip install '{package}' --find-links WHEELS (a folder with the release's wheels)"

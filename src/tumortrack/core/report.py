@@ -50,6 +50,7 @@ class _Said(msgspec.Struct, forbid_unknown_fields=True):
 
 
 _SAID = read_table("tumortrack.core", "findings.toml", _Said)
+_SENTENCES = {kind: said for kind, (_, said) in _SAID.poor.items()} | _SAID.none | _SAID.case
 
 
 class _WithoutNumbers(string.Formatter):
@@ -71,18 +72,13 @@ class Finding(msgspec.Struct, frozen=True):
         return _SAID.poor[self.kind][0] if self.kind in _SAID.poor else "none"
 
     @property
-    def _sentence(self) -> str:
-        sentences = _SAID.none | _SAID.case
-        return sentences.get(self.kind) or _SAID.poor[self.kind][1]
-
-    @property
     def words(self) -> str:
-        return self._sentence.format(**self.values)
+        return _SENTENCES[self.kind].format(**self.values)
 
     @property
     def words_without_numbers(self) -> str:
         """For counts of what happened often."""
-        return _WithoutNumbers().vformat(self._sentence, (), self.values)
+        return _WithoutNumbers().vformat(_SENTENCES[self.kind], (), self.values)
 
     @property
     def same_as(self) -> tuple[Kind, object]:

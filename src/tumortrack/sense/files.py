@@ -12,7 +12,7 @@ import struct
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32
@@ -226,77 +226,66 @@ _CLOUDS: dict[str, Callable[[bytes, str, str], np.ndarray]] = {
 CLOUD_SUFFIXES = tuple(_CLOUDS)
 
 
+class _Camera(NamedTuple):
+    """A camera's file: the mm of a step of depth are None where it does not say."""
+
+    intrinsics: Intrinsics
+    correction: DepthCorrection
+    unit_mm: float | None
+
+
 def read_intrinsics(path: Path) -> Intrinsics:
     """A pinhole camera from JSON: width, height, fx, fy, cx (or ppx), cy (or ppy), in pixels.
     Raises InputError: missing, not JSON, a key missing or no number, or lens distortion."""
-    return _camera(path)[0]
+    return _camera(path).intrinsics
 
 
 def read_camera(path: Path | None) -> tuple[Intrinsics | None, DepthCorrection]:
     """A camera as ``read_intrinsics`` reads it, and the file's depth correction, if any."""
-    if path is None:
-        return None, DepthCorrection()
-    camera, data = _camera(path)
-    return camera, _correction(data, path)
+    return (None, DepthCorrection()) if path is None else _camera(path)[:2]
 
 
-def _correction(data: dict[str, Any], path: Path) -> DepthCorrection:
-    scale = _numbers(data.get("depth_scale", 1.0), "depth_scale", path)[0]
-    offset_mm = _numbers(data.get("depth_offset_mm", 0.0), "depth_offset_mm", path)[0]
-    try:
-        return DepthCorrection(scale=scale, offset_mm=offset_mm)
-    except InputError as error:
-        raise InputError(f"{path}: {error} The mm of one step are depth_unit_mm.") from error
-
-
-def _camera(path: Path) -> tuple[Intrinsics, dict[str, Any]]:
+def _camera(path: Path) -> _Camera:
     data = read_json(path)
+    data = {key: data[other] for key, other in _OTHER_KEYS.items() if other in data} | data
     for key in _DISTORTION_KEYS:
-        if any(_numbers(data.get(key, 0), key, path)):
+        values = data.get(key, 0)
+        if any(values if isinstance(values, list) else [values]):
             raise InputError(
                 f"{path}: {key!r} states lens distortion. Give the rectified depth and its camera."
             )
-    values = {}
-    for key in _PINHOLE_KEYS:
-        value = data.get(key, data.get(_OTHER_KEYS.get(key, "")))
-        if value is None or isinstance(value, list):
-            needed = "width, height, fx, fy, cx (or ppx), cy (or ppy)"
-            raise InputError(f"{path} lacks the number {key!r}; it must have {needed}, in pixels.")
-        values[key] = _numbers(value, key, path)[0]
-    for key in ("width", "height"):
-        if not values[key].is_integer():
-            raise InputError(f"{path}: {key} is {values[key]}; it must be a whole number.")
-    camera = Intrinsics(
-        width=int(values["width"]),
-        height=int(values["height"]),
-        fx=values["fx"],
-        fy=values["fy"],
-        cx=values["cx"],
-        cy=values["cy"],
-        depth_error=_depth_error(data, path),
-    )
-    return plausible(camera, str(path)), data
 
+    def number(key: str, default: float | None = None) -> float:
+        try:
+            value = float(data.get(key, default))  # type: ignore[arg-type]
+        except (TypeError, ValueError, OverflowError):
+            value = math.nan
+        if not math.isfinite(value):
+            raise InputError(
+                f"{path}: {key!r} is {str(data.get(key))[:60]}; it must be a finite number. A "
+                "camera has width, height, fx, fy, cx (or ppx), cy (or ppy), in pixels."
+            )
+        return value
 
-def _depth_error(data: dict[str, Any], path: Path) -> DepthError | None:
-    """What a calibration leaves; None: the file states no calibration."""
-    if not data.keys() & {_LEFT_KEY, "depth_scale", "depth_offset_mm"}:
-        return None
-    left_mm = _numbers(data.get(_LEFT_KEY, CALIBRATED_MM), _LEFT_KEY, path)[0]
-    if not 0 <= left_mm <= MOST_LEFT_MM:
-        raise InputError(f"{path}: {_LEFT_KEY} is {left_mm}; allowed: 0 to {MOST_LEFT_MM:g} mm.")
-    return DepthError(left_mm)
-
-
-def _numbers(value: object, key: str, path: Path) -> list[float]:
-    """One number or a list of numbers as finite floats."""
+    width, height, fx, fy, cx, cy = map(number, _PINHOLE_KEYS)
+    for key, pixels in (("width", width), ("height", height)):
+        if not pixels.is_integer():
+            raise InputError(f"{path}: {key} is {pixels}; it must be a whole number.")
+    error = None  # nobody has calibrated it
+    if data.keys() & {_LEFT_KEY, "depth_scale", "depth_offset_mm"}:
+        error = DepthError(number(_LEFT_KEY, CALIBRATED_MM))
+        if not 0 <= error.offset_mm <= MOST_LEFT_MM:
+            raise InputError(
+                f"{path}: {_LEFT_KEY} is {error.offset_mm}; allowed: 0 to {MOST_LEFT_MM:g} mm."
+            )
+    scale, offset_mm = number("depth_scale", 1.0), number("depth_offset_mm", 0.0)
     try:
-        numbers = [float(v) for v in (value if isinstance(value, list) else [value])]  # type: ignore
-    except (TypeError, ValueError, OverflowError):
-        numbers = [np.nan]
-    if not np.isfinite(numbers).all():
-        raise InputError(f"{path}: {key!r} is {str(value)[:60]}; it must be a finite number.")
-    return numbers
+        correction = DepthCorrection(scale=scale, offset_mm=offset_mm)
+        camera = Intrinsics(int(width), int(height), fx, fy, cx, cy, error)
+    except InputError as fault:
+        raise InputError(f"{path}: {fault} The mm of one step are depth_unit_mm.") from fault
+    unit_mm = number("depth_unit_mm") if "depth_unit_mm" in data else None
+    return _Camera(plausible(camera, str(path)), correction, unit_mm)
 
 
 def intrinsics_json(intrinsics: Intrinsics) -> dict[str, Any]:
@@ -322,16 +311,16 @@ def read_depth(
     (metres) for floats. The file's depth correction is applied. Whether the unit can be right is
     left to ``cloud.check_depth_unit``. Raises InputError: no such image, of another size than the
     intrinsics, or no valid unit."""
-    intrinsics, data = _camera(intrinsics_path)
+    intrinsics, correction, stated_mm = _camera(intrinsics_path)
     steps, mode = _image(path, (intrinsics.width, intrinsics.height))
     if not mode.startswith(("I", "F")):
         raise InputError(f"{path} has pixels of the kind {mode}; allowed: 16-bit grey, or floats.")
-    default = DEPTH_UNIT_MM if mode.startswith("I") else 1000.0
-    stated = data.get("depth_unit_mm", default) if unit_mm is None else unit_mm
-    unit_mm = _numbers(stated, "depth_unit_mm", intrinsics_path)[0]
+    if unit_mm is None:
+        default_mm = DEPTH_UNIT_MM if mode.startswith("I") else 1000.0
+        unit_mm = default_mm if stated_mm is None else stated_mm
     if not 0 < unit_mm <= 1000:
         raise InputError(f"depth_unit_mm is {unit_mm}; it must lie in 0..1000 mm per step.")
-    depth_mm = _correction(data, intrinsics_path).corrected(depths_mm(steps, unit_mm))
+    depth_mm = correction.corrected(depths_mm(steps, unit_mm))
     return DepthFrame(depth_mm, intrinsics), unit_mm
 
 

@@ -1,26 +1,23 @@
-"""The per-pixel work of ``noise`` and ``occlusion``, compiled; imported on first use."""
+"""Compiled work of ``noise`` on each pixel with a return; imported on first use."""
 
 from __future__ import annotations
 
 import math
 from functools import lru_cache
-from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int32
+from jaxtyping import Float32
+from scipy.special import ndtri
 
-from tumortrack.native import F32, F64, I32, I64, U8, kernel
-from tumortrack.sense.camera import Pinhole
+from tumortrack.native import F32, F64, I32, kernel
 
-# Quantiles of the normal distribution: a hash's low 14 bits choose one. Scaled to variance 1.
-_QUANTILES = np.array([NormalDist().inv_cdf((n + 0.5) / 2**14) for n in range(2**14)])
+# Of the normal distribution: a hash's low 14 bits choose one. Scaled to variance 1.
+_QUANTILES = ndtri((np.arange(2**14) + 0.5) / 2**14)
 _QUANTILES = (_QUANTILES / _QUANTILES.std()).astype(np.float32)
-_BINS = 1024  # of the histogram in ``take_first``
 
 _DEPTH = F32["height", "width"].any_value  # NaN: no return
 _SEEN = I32["n"], I32["starts"]
-_PINHOLE, _TWO = (float,) * 4, (float, float)
 _TABLE = F32[len(_QUANTILES)].any_value
 
 
@@ -43,59 +40,18 @@ def seen_pixels(depth_mm: Float32[np.ndarray, "h w"]) -> Seen:
     return Seen(pixels[:count], starts)
 
 
-# Depths, their list, what it lists, key, share that is lost, the cosine from which; the camera,
-# squared tangents of the columns.
-_lose_grazing = kernel(
+# Drops pixels that see a surface at grazing angles. Depths, their list, what it lists, key, the
+# share that is lost, the cosine from which; the camera, squared tangents of the columns.
+lose_grazing = kernel(
     "lose_grazing",
-    *(_DEPTH, F32["n"].out, _SEEN, int, float, float, _PINHOLE, F64["width"]),
+    *(_DEPTH, F32["n"].out, _SEEN, int, float, float, (float,) * 4, F64["width"]),
 )
-
-
-def lose_grazing(
-    true_mm: Float32[np.ndarray, "h w"],
-    depths_mm: Float32[np.ndarray, " n"],
-    seen: Seen,
-    key: int,
-    grazing: tuple[float, float],
-    pinhole: Pinhole,
-) -> None:
-    """Drop pixels that see a surface at grazing angles; ``grazing``: (share that is dropped, from
-    how many degrees between the normal and the line of sight)."""
-    share, degrees = grazing
-    across = ((np.arange(true_mm.shape[1]) - pinhole.cx) / pinhole.fx) ** 2
-    cosine = math.cos(math.radians(degrees))
-    depth_mm = np.ascontiguousarray(true_mm)
-    _lose_grazing(depth_mm, depths_mm, seen, key, share, cosine, pinhole, across)
-
-
-class Flying(NamedTuple):
-    """Flying pixels: the share of edge pixels, how far behind the edge they end up at most, and
-    what is an edge: within ``near_px`` the depth falls back by ``step_mm`` or more, or ends."""
-
-    share: float
-    reach_mm: float
-    near_px: int
-    step_mm: float
-
-
-# Depths, their list, what it lists, key, and how.
-_fly = kernel("fly", _DEPTH, F32["n"].out, _SEEN, int, (float, float, int, float))
-
-
-def fly(
-    true_mm: Float32[np.ndarray, "h w"],
-    depths_mm: Float32[np.ndarray, " n"],
-    seen: Seen,
-    key: int,
-    flying: Flying,
-) -> None:
-    """Send edge pixels backwards, as ``Flying`` states. The image's own border is no edge: what it
-    cuts off continues outside."""
-    _fly(np.ascontiguousarray(true_mm), depths_mm, seen, key, flying)
-
-
-# Adds to depths, of these pixels, by key: relative noise, the weights of each pixel's own and of
-# that of a smooth field, which follows.
+# Sends edge pixels backwards: those within so many px of which the depth falls back by a step or
+# more, or ends; the image's own border is no edge. Depths, their list, what it lists, key; the
+# share of edge pixels, how far behind the edge they end up at most, px, mm of a step.
+fly = kernel("fly", _DEPTH, F32["n"].out, _SEEN, int, (float, float, int, float))
+# Adds noise to depths. Of these pixels, by key: its relative size, the weights of each pixel's own
+# and of that of a smooth field, which follows.
 _jitter = kernel(
     "jitter", F32["n"].out, I32["n"], int, float, float, float, F32["n"].any_value, _TABLE
 )
@@ -155,65 +111,3 @@ def _lowest_cosines(n: int) -> np.ndarray:
     waves = np.cos(np.pi * np.outer((np.arange(n) + 0.5) / n, np.arange(3))).astype(np.float32)
     waves.flags.writeable = False
     return waves
-
-
-# Columns, rows, tip, direction, half the width, taper.
-_order_shaft = kernel("order_shaft", I32["n"], I32["n"], _TWO, _TWO, float, float, F32["n"].out)
-
-
-def order_shaft(
-    columns: Int32[np.ndarray, " n"],
-    rows: Int32[np.ndarray, " n"],
-    tip: Float64[np.ndarray, " 2"],
-    towards: Float64[np.ndarray, " 2"],
-    half: float,
-    taper: float,
-) -> Float32[np.ndarray, " n"]:
-    """A straight band that comes in against ``towards`` (unit vector, px) and ends round at
-    ``tip`` (px), ``half`` wide there to either side and wider by ``taper`` a pixel outwards.
-    What lies farthest out comes first, as when it is pushed in."""
-    order = np.empty(len(columns), np.float32)
-    _order_shaft(columns, rows, tip, towards, half, taper, order)
-    return order
-
-
-# Columns, rows, start, axes, whether it is round, waves of its edge; room for these.
-_order_patch = kernel(
-    "order_patch",
-    *(I32["n"], I32["n"], _TWO, (_TWO, _TWO), int, F64[2, "waves", 3]),
-    *(F32["width"].out, F32["height"].out, F32["n"].out),
-)
-
-
-def order_patch(
-    columns: Int32[np.ndarray, " n"],
-    rows: Int32[np.ndarray, " n"],
-    start: Float64[np.ndarray, " 2"],
-    axes: Float64[np.ndarray, "2 2"],
-    round_one: bool,
-    waves: Float64[np.ndarray, "2 k 3"],
-) -> Float32[np.ndarray, " n"]:
-    """A patch with a wavy edge that grows from ``start`` (px): a blob or a half plane.
-
-    ``axes``, 1/px: a blob's two lengths and directions; a half plane grows along the first.
-    ``waves``: frequency (rad/px), phase and height of the edge's waves along the columns and along
-    the rows.
-    """
-    along = (np.empty(places.max() + 1, np.float32) for places in (columns, rows))
-    order = np.empty(len(columns), np.float32)
-    _order_patch(columns, rows, start, axes, round_one, waves, *along, order)
-    return order
-
-
-# Order, what is taken, how many; a histogram. Both precisions are in use, and bins differ.
-_take_first, _take_first_wide = (
-    kernel(name, order["n"].any_value, U8["n"].out, int, I64[_BINS].out, result=int)
-    for name, order in (("take_first", F32), ("take_first_wide", F64))
-)
-
-
-def take_first(order: Float[np.ndarray, " n"], taken: Bool[np.ndarray, " n"], count: int) -> int:
-    """Mark in ``taken`` the ``count`` pixels of lowest ``order`` that are not taken yet, or a few
-    less (whole bins of a histogram only); infinite ones never. Returns how many."""
-    take = _take_first if order.dtype == np.float32 else _take_first_wide
-    return int(take(order, taken.view(np.uint8), count, np.empty(_BINS, np.int64)))

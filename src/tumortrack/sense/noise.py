@@ -13,6 +13,7 @@ Neighbouring pixels share most of a matching window, so their errors are correla
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -232,15 +233,16 @@ def _disturb(
 
     from tumortrack.sense import kernels
 
-    true_mm, shape = frame.depth_mm, frame.depth_mm.shape
+    true_mm, shape = np.ascontiguousarray(frame.depth_mm), frame.depth_mm.shape
     if config.flying_share:
-        edge = config.edge_px, config.edge_mm
-        flying = kernels.Flying(config.flying_share, config.flying_mm, *edge)
+        flying = config.flying_share, config.flying_mm, config.edge_px, config.edge_mm
         kernels.fly(true_mm, depths_mm, seen, seed + 1, flying)
     if config.grazing_share:
-        grazing = config.grazing_share, config.grazing_degrees
         pinhole = pinhole_of(frame.intrinsics)
-        kernels.lose_grazing(true_mm, depths_mm, seen, seed + 2, grazing, pinhole)
+        cosine = math.cos(math.radians(config.grazing_degrees))
+        across = ((np.arange(shape[1]) - pinhole.cx) / pinhole.fx) ** 2
+        lost = seed + 2, config.grazing_share, cosine
+        kernels.lose_grazing(true_mm, depths_mm, seen, *lost, pinhole, across)
     if config.distortion_mm:
         rng = np.random.default_rng((seed, 1))
         field, scale = kernels.slow_shape(shape, config.distortion_mm * rng.random(), rng)

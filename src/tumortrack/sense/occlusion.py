@@ -9,12 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Bool, Float, Float32, Int32
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
-from tumortrack.sense.kernels import order_patch, order_shaft, seen_pixels, take_first
 
 _SAMPLED = 200  # pixels that show where the organ lies
 _STEEPEST = 0.6  # slope of what is left in: 30 degrees
@@ -23,6 +22,7 @@ _CROSSES = 0.25  # share of shafts that cross the whole organ
 _WIDER = 0.3  # a shaft that rises towards the camera looks wider by up to this an organ's width
 _WAVES = 3
 _PATCHES_ALONE, _SHAFTS_ALONE = 0.4, 0.2  # shares of images; the others have both
+_BINS = 1024  # of the histogram in ``take_first``
 
 
 class OcclusionConfig(Config, frozen=True, kw_only=True):
@@ -87,6 +87,8 @@ def occlude(frame: DepthFrame, config: OcclusionConfig, rng: np.random.Generator
 
 
 def _look(frame: DepthFrame, rng: np.random.Generator) -> _View:
+    from tumortrack.sense.kernels import seen_pixels  # with SciPy, slow to import
+
     pixels, starts = seen_pixels(frame.depth_mm)
     rows = np.repeat(np.arange(len(starts) - 1, dtype=np.int32), np.diff(starts))
     columns = pixels - rows * np.int32(frame.intrinsics.width)
@@ -136,6 +138,62 @@ def _patch(seen: _View, rng: np.random.Generator) -> np.ndarray:
     phase = rng.uniform(0, 2 * np.pi, (2, _WAVES))
     waves = np.stack([frequency / seen.width_px, phase, height], axis=2)
     return order_patch(seen.columns, seen.rows, start, axes, bool(rng.integers(2)), waves)
+
+
+def order_shaft(
+    columns: Int32[np.ndarray, " n"],
+    rows: Int32[np.ndarray, " n"],
+    tip: Float[np.ndarray, " 2"],
+    towards: Float[np.ndarray, " 2"],
+    half: float,
+    taper: float,
+) -> Float32[np.ndarray, " n"]:
+    """In what order pixels are hidden by a straight band that comes in against ``towards`` (unit
+    vector, px) and ends round at ``tip`` (px), ``half`` wide there to either side and wider by
+    ``taper`` a pixel outwards: what lies farthest out first, what lies outside infinite."""
+    right, down = columns - tip[0], rows - tip[1]
+    along = right * towards[0] + down * towards[1]
+    across = np.abs(down * towards[0] - right * towards[1])
+    round_tip = right * right + down * down < half * half
+    inside = np.where(along >= 0, across < half + taper * along, round_tip)
+    return np.where(inside, -along, np.inf).astype(np.float32)
+
+
+def order_patch(
+    columns: Int32[np.ndarray, " n"],
+    rows: Int32[np.ndarray, " n"],
+    start: Float[np.ndarray, " 2"],
+    axes: Float[np.ndarray, "2 2"],
+    blob: bool,
+    waves: Float[np.ndarray, "2 k 3"],
+) -> Float32[np.ndarray, " n"]:
+    """The same for a patch with a wavy edge that grows from ``start`` (px): a blob with two lengths
+    and directions, or a half plane along the first of the ``axes`` (1/px). ``waves``: frequency
+    (rad/px), phase and height of the edge's waves along the columns and along the rows."""
+    right, down = columns - start[0], rows - start[1]
+    one, two = (right * a + down * b for a, b in axes)
+    order = np.sqrt(one * one + two * two) if blob else one
+    for places, of in zip((columns, rows), waves, strict=True):
+        edge = np.zeros(places.max() + 1, np.float32)
+        for frequency, phase, height in of:
+            edge += height * np.cos(frequency * np.arange(len(edge)) + phase)
+        order = order + edge[places]
+    return order.astype(np.float32)
+
+
+def take_first(order: Float[np.ndarray, " n"], taken: Bool[np.ndarray, " n"], count: int) -> int:
+    """Mark in ``taken`` the ``count`` pixels of lowest ``order`` that are not taken yet, or a few
+    less (whole bins of a histogram only); infinite ones never. Returns how many."""
+    free = ~taken & (order < np.inf)
+    if not free.any():
+        return 0
+    low, high = order[free].min(), order[free].max()
+    bins = (order - low).astype(float) * ((_BINS - 1) / float(max(high - low, np.float32(1e-6))))
+    if np.count_nonzero(free) > count:
+        sizes = np.bincount(np.clip(bins[free], 0, _BINS - 1).astype(int))
+        free &= bins < np.searchsorted(np.cumsum(sizes), count, side="right")
+    taken |= free
+    return int(np.count_nonzero(free))
 
 
 def _leave_in(

@@ -1,4 +1,4 @@
-// Points inside a surface, points on one, and points that lie far apart.
+// Points inside a surface, and points that lie far apart.
 #include "triangle.h"
 
 // Whether, projected on x and y, the edge passes to the right of the point.
@@ -49,56 +49,6 @@ KERNEL(void, faces_above) {
                 double s = ((x - p[0]) * (r[1] - p[1]) - (y - p[1]) * (r[0] - p[0])) / area;
                 double t = ((q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0])) / area;
                 inside[i] ^= p[2] + s * (q[2] - p[2]) + t * (r[2] - p[2]) > points[3 * i + 2];
-            }
-        }
-    }
-}
-
-// Into how many parts each edge of a triangle is cut, so that none is longer than `spacing`; the
-// result is how many triangles there are then.
-struct cut_edges { f64_3 triangles; double spacing; i64_1 cuts; };
-KERNEL(int64_t, cut_edges) {
-    int64_t count = 0;
-    for (int64_t f = 0; f < a->triangles.n[0]; f++) {
-        const double *corner = a->triangles.at + 9 * f;
-        double longest = 0;
-        for (int n = 0; n < 3; n++) {
-            const double *p = corner + 3 * n, *q = corner + 3 * ((n + 2) % 3);
-            double x = p[0] - q[0], y = p[1] - q[1], z = p[2] - q[2];
-            double length = sqrt(x * x + y * y + z * z);
-            longest = length > longest ? length : longest;
-        }
-        // 2^20: their sum stays an int64_t, and there is no memory for so many
-        int64_t cuts = (int64_t)clampd(ceil(longest / a->spacing), 1, 1 << 20);
-        a->cuts.at[f] = cuts;
-        count += cuts * cuts;
-    }
-    return count;
-}
-
-// The middles of the triangles that equal cuts of the edges make, and each one's area. There are
-// as many as `cut_edges` counted.
-struct spread { f64_3 triangles; i64_1 cuts; f64_2 points; f64_1 areas; };
-KERNEL(void, spread) {
-    double *at = a->points.at, *area_at = a->areas.at;
-    for (int64_t f = 0; f < a->triangles.n[0]; f++) {
-        const double *p = a->triangles.at + 9 * f, *q = p + 3, *r = p + 6;
-        const int64_t n = a->cuts.at[f];
-        double x = (q[1] - p[1]) * (r[2] - p[2]) - (q[2] - p[2]) * (r[1] - p[1]);
-        double y = (q[2] - p[2]) * (r[0] - p[0]) - (q[0] - p[0]) * (r[2] - p[2]);
-        double z = (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]);
-        double area = sqrt(x * x + y * y + z * z) / 2 / (double)(n * n);
-        for (int64_t row = 0; row < n; row++) {
-            for (int64_t place = 0; place < 2 * row + 1; place++) {
-                int64_t down = place % 2;  // pointing up and down in turn
-                double third = down ? 2.0 / 3 : 1.0 / 3;
-                double u = ((double)(row - place / 2 - down) + third) / (double)n;
-                double v = ((double)(place / 2) + third) / (double)n;
-                for (int axis = 0; axis < 3; axis++) {
-                    double own = p[axis];
-                    *at++ = own + u * (q[axis] - own) + v * (r[axis] - own);
-                }
-                *area_at++ = area;
             }
         }
     }

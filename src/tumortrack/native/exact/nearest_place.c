@@ -3,32 +3,6 @@
 
 enum { WIDE = 8, MOST_LEVELS = 12 };  // boxes in a box, triangles in a leaf; for 2^31 triangles
 
-// How far along Hilbert's curve cells (n, 3) below 1024 are: Skilling 2004, Programming the Hilbert
-// curve, doi 10.1063/1.1751381.
-struct along_curve { i64_2 cells; i64_1 keys; };
-KERNEL(void, along_curve) {
-    for (int64_t n = 0; n < a->cells.n[0]; n++) {
-        const int64_t *cell = a->cells.at + 3 * n;
-        uint32_t x[3] = {(uint32_t)cell[0], (uint32_t)cell[1], (uint32_t)cell[2]};
-        for (int bit = 9; bit > 0; bit--) {
-            uint32_t low = (1u << bit) - 1;
-            for (int axis = 0; axis < 3; axis++) {
-                uint32_t set = -(x[axis] >> bit & 1), swapped = (x[0] ^ x[axis]) & low & ~set;
-                x[0] ^= (low & set) | swapped;
-                x[axis] ^= swapped;
-            }
-        }
-        x[1] ^= x[0];
-        x[2] ^= x[1];
-        uint32_t turn = 0, key = 0;
-        for (int bit = 9; bit > 0; bit--) turn ^= x[2] >> bit & 1 ? (1u << bit) - 1 : 0;
-        for (int bit = 0; bit < 10; bit++)
-            for (int axis = 0; axis < 3; axis++)
-                key |= ((x[axis] ^ turn) >> bit & 1) << (3 * bit + 2 - axis);
-        a->keys.at[n] = key;
-    }
-}
-
 // Triangles in the order of the curve. Leaves (n, 7, 8) have each one's middle, unit normal (0 if
 // it is a line) and radius; boxes (m, 6, 8) the lower and upper corners of those in them. Leaves
 // are level 0, one box is the last; each level's boxes begin at `firsts`. What fills the last of a

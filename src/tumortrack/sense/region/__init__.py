@@ -19,10 +19,9 @@ from tumortrack.sense.cloud import FEWEST_POINTS
 from tumortrack.sense.measured_noise import DepthNoise, image_noise
 from tumortrack.sense.noise import REFERENCE_MM
 from tumortrack.sense.region.choose import choose_pieces
-from tumortrack.sense.region.hints import Hints
 from tumortrack.sense.region.pieces import remove_flying
 from tumortrack.sense.region.plane import remove_plane
-from tumortrack.sense.region.tissue import colours_of
+from tumortrack.sense.region.tissue import Hints, colours_of
 from tumortrack.sense.region.working_image import (
     BOX,
     COLOUR,

@@ -10,8 +10,8 @@ import numpy as np
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.report import Finding
 from tumortrack.native import F64, I32, U8, kernel
-from tumortrack.sense.region.hints import Hints
 from tumortrack.sense.region.pieces import find_edges, find_pieces
+from tumortrack.sense.region.tissue import Hints
 from tumortrack.sense.region.working_image import (
     DEPTH,
     LAST_BOX,

@@ -11,11 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float, Float32, UInt8
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.report import Finding
 from tumortrack.core.types import DepthFrame
+from tumortrack.sense.measured_noise import DepthNoise
 from tumortrack.sense.region.working_image import (
     ORGAN,
     WorkingImage,
@@ -94,6 +95,28 @@ class TissueClassifier:
         own, other = apart[:, self.organ].min(1), apart[:, ~self.organ].min(1)
         known = np.minimum(own, other) < _KNOWN
         return np.clip((other - own) / 2, -_CLEAR, _CLEAR) * known, known
+
+
+@dataclass(frozen=True, eq=False)
+class Hints:
+    """What is known about a frame besides its depth.
+
+    Attributes:
+        mask: of a depth image's pixels, True where the organ may be.
+        picked_mm: a point on the organ, camera frame; selects the piece. Organs move: once there is
+            an estimate, give its box instead.
+        last_box_mm: lower and upper corner of the last estimate's organ, camera frame.
+        picture: colour or grey image in the depth image's pixels, for ``taught``.
+        taught: tells the organ from other tissue by colour. None: only geometry counts.
+        noise: of this camera, as an earlier frame showed it; None: it is measured.
+    """
+
+    mask: Bool[np.ndarray, "h w"] | None = None
+    picked_mm: Float[np.ndarray, " 3"] | None = None
+    last_box_mm: Float[np.ndarray, "2 3"] | None = None
+    picture: UInt8[np.ndarray, "h w *rgb"] | None = None
+    taught: TissueClassifier | None = None
+    noise: DepthNoise | None = None
 
 
 def colours_of(frame: DepthFrame, picture: Colours) -> Colours:

@@ -60,11 +60,19 @@ def _loaded(point: EntryPoint, twice: bool) -> Extension:
     package = point.dist.name if point.dist else "an installed package"
     try:
         config = point.load()
-        fault = _fault(config, point.name, twice)
+        if point.name in (*_OURS, "chain"):
+            raise TypeError(f"{point.name!r} is built in, and cannot be replaced")
+        if twice:
+            raise TypeError(f"two packages offer {point.name!r}")
+        if not (isinstance(config, type) and issubclass(config, Config)):
+            raise TypeError("it is not a tumortrack.core.config.Config")
+        if (tag := config.__struct_config__.tag) != point.name:
+            raise TypeError(f"its tag is {tag!r}; it must be {point.name!r}, as its entry point")
+        if not callable(getattr(config, "sample", None)):
+            raise TypeError("it has no method sample(view, rng)")
+        return Extension(point.name, package, "", config)
     except Exception as error:  # another package's code may raise anything
         fault = f"{type(error).__name__}: {error}"
-    if not fault:
-        return Extension(point.name, package, "", config)
 
     def refuse(self: object) -> None:
         raise PackageError(
@@ -76,17 +84,3 @@ def _loaded(point: EntryPoint, twice: bool) -> Extension:
         "Refused", [], tag=point.name, frozen=True, namespace={"__post_init__": refuse}
     )
     return Extension(point.name, package, fault, refused)
-
-
-def _fault(config: Any, name: str, twice: bool) -> str:
-    if name in {**_OURS, "chain": None}:
-        return f"{name!r} is built in, and cannot be replaced"
-    if twice:
-        return f"two packages offer {name!r}"
-    if not (isinstance(config, type) and issubclass(config, Config)):
-        return "it is not a tumortrack.core.config.Config"
-    if config.__struct_config__.tag != name:
-        return (
-            f"its tag is {config.__struct_config__.tag!r}; it must be {name!r}, as its entry point"
-        )
-    return "" if callable(getattr(config, "sample", None)) else "it has no method sample(view, rng)"

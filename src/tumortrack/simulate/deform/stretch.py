@@ -14,16 +14,12 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from tumortrack.core.config import Config
-from tumortrack.native import F32, F64, kernel
 from tumortrack.simulate.deform.base import Points, View
-
-# Points -> centre + matrix (offset + (offset . along)^2 bend), where offset = point - centre.
-_stretch = kernel("stretch", F64["n", 3], F64[3], F64[3, 3], F64[3], F64[3], F32["n", 3].out)
 
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """x -> centre + matrix (x - centre) + sagitta ((x - centre) . along / reach)^2 across."""
+    """x -> centre + matrix (x - centre + sagitta ((x - centre) . along / reach)^2 across)."""
 
     centre_ct: Float64[np.ndarray, " 3"]
     matrix: Float64[np.ndarray, "3 3"]
@@ -33,11 +29,10 @@ class Stretch:
     reach_mm: float
 
     def apply(self, points_ct: Points) -> Float32[np.ndarray, "n 3"]:
-        points, matrix = (np.ascontiguousarray(x, np.float64) for x in (points_ct, self.matrix))
-        bend = self.along / self.reach_mm, self.sagitta_mm * self.across
-        out = np.empty(points.shape, np.float32)
-        _stretch(points, self.centre_ct, matrix, *bend, out)
-        return out
+        offset = np.asarray(points_ct, np.float64) - self.centre_ct
+        reach = (offset @ self.along / self.reach_mm)[:, None]
+        bent = offset + self.sagitta_mm * reach**2 * self.across
+        return (bent @ self.matrix.T + self.centre_ct).astype(np.float32)
 
     def record(self) -> dict[str, Any]:
         numbers = {name: np.asarray(value).tolist() for name, value in vars(self).items()}
