@@ -6,14 +6,11 @@ import socket
 import struct
 from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 import pytest
-from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from browser import Browser
 from clock import until
 from igtl_objects import hear_all
 from live_objects import STAMP_NS, empty_update, small_setting, small_update
@@ -28,6 +25,7 @@ from tumortrack_devices.ros.messages import Messages
 from tumortrack_devices.ros.results import ResultMessages
 from tumortrack_devices.sinks.openigtlink import OpenIgtLinkSinkConfig
 from tumortrack_devices.sinks.viewer import ViewerSinkConfig
+from viewer_page import LOOK, page
 
 TURN = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
 ROBOT = PublishedFrame("robot", rigid(TURN, np.array([400.0, -250.0, 90.0])))
@@ -142,7 +140,7 @@ def test_what_contradicts_stays_in_sight_for_seconds_and_free_places_are_left_ou
 def test_the_viewer_shows_them_where_they_are_unless_they_are_switched_off():
     sink = ViewerSinkConfig(port=0, hz=60).open(replace(small_setting(), published_frame=ROBOT))
     with closing(sink):
-        nodes = sink._server.scene.get_handle_by_name
+        nodes = sink.server.scene.get_handle_by_name
         labels = [nodes(f"/estimate/next_{n}") for n in range(3)]
         sink.publish(told(touch=(KNOWN_MM, False), outline=(FAR_MM, True)))
         spots = nodes("/estimate/next")
@@ -154,70 +152,33 @@ def test_the_viewer_shows_them_where_they_are_unless_they_are_switched_off():
             assert nodes(f"/estimate/{name}").points == pytest.approx(there, abs=1e-3)
         assert spots.visible
         assert all(label.visible for label in labels)
-        sink._scene.change(replace(sink._panel.options, evidence=False))
-        assert not any(node.visible for node in (spots, nodes("/estimate/known"), *labels))
-        sink._scene.change(replace(sink._panel.options, evidence=True))
-        assert all(node.visible for node in (spots, *labels))
+        with page(sink) as visitor:
+            for on in (False, True):
+                visitor.change("Evidence, next touches", on)
+                until(lambda on=on: spots.visible is on, "the change")
+                for node in (nodes("/estimate/known"), *labels):
+                    until(lambda on=on, node=node: node.visible is on, "the change")
         sink.publish(replace(empty_update(1), published_frame=ROBOT))
-        assert not any(len(nodes(f"/estimate/{n}").points) for n in sink._scene._spots)
+        for name in ("next", "known", "contradicting"):
+            assert not len(nodes(f"/estimate/{name}").points)
         assert not any(label.visible for label in labels)
-
-
-def label_boxes(browser: Browser) -> list[tuple[slice, ...]]:
-    """Rows and columns of each label's box: light, and larger than any observed point."""
-    light = (browser.picture() > 190).all(axis=2)
-    light[:110] = False  # the banner
-    pieces, _ = ndimage.label(light)
-    found = ndimage.find_objects(pieces)
-    return [box for box in found if box[0].stop - box[0].start > 12 and width_of(box) > 40]
-
-
-def width_of(box: tuple[slice, ...]) -> int:
-    return int(box[1].stop - box[1].start)
-
-
-def apart_and_whole(boxes: list[tuple[slice, ...]], width: int) -> bool:
-    """Three of equal width, as their words are equally long, within the page."""
-    widths = [width_of(box) for box in boxes]
-    return (
-        len(boxes) == 3
-        and max(widths) - min(widths) <= 3
-        and max(box[1].stop for box in boxes) < width
-        and all(
-            any(a.stop <= b.start or b.stop <= a.start for a, b in zip(one, other, strict=True))
-            for one, other in combinations(boxes, 2)
-        )
-    )
-
-
-@pytest.mark.slow
-def test_on_a_phone_labels_of_places_near_each_other_neither_overlap_nor_are_cut_off(monkeypatch):
-    monkeypatch.setattr("tumortrack_devices.sinks.viewer._STALE_S", 60.0)  # of a busy machine
-    near = np.array([[0.0, 0.0, 0.0], [3.0, -5.0, 0.0], [24.0, -2.0, 0.0]])
-    aim = NOW.back(np.array([[0.0, 0.0, 104.0]]))
-    update = told(points_ct=NOW.back(near + NOW.carry(aim)))
-    update = replace(update, organ=None, observation=None)
-    sink = ViewerSinkConfig(port=0, hz=60).open(replace(small_setting(), published_frame=ROBOT))
-    with closing(sink), Browser(390, 844) as browser:
-        browser.open(sink.url)
-
-        def shown() -> bool:
-            sink.publish(update)
-            return "GOOD" in browser.text() and apart_and_whole(label_boxes(browser), 390)
-
-        until(shown, "three whole labels apart")
 
 
 def test_a_place_behind_a_tumor_has_no_label():
     sink = ViewerSinkConfig(port=0).open(replace(small_setting(), published_frame=ROBOT))
-    with closing(sink):
+    with closing(sink), page(sink) as visitor:
         update, place_mm = told(), published(POINTS_CT, NOW)[0]
-        sink._scene.beside.update(update)
         tumor_mm = update.transformed.meshes["tumor_1"].box_mm.mean(0)
+        label = sink.server.scene.get_handle_by_name("/estimate/next_0")
         for share, bare in ((2.0, False), (-1.0, True)):  # beyond the tumor; on this side
-            sink._scene.look._eye_mm = place_mm + share * (tumor_mm - place_mm)
-            sink._scene.show(update)
-            assert sink._server.scene.get_handle_by_name("/estimate/next_0").visible is bare
+            eye_mm = (place_mm + share * (tumor_mm - place_mm)).tolist()
+            visitor.say("ViewerCameraMessage", **LOOK | {"position": eye_mm})
+
+            def seen(bare: bool = bare) -> bool:
+                sink.publish(update)
+                return label.visible is bare and label.text == LABELS[0]
+
+            until(seen, "the label")
 
 
 def test_ros_has_them_as_spheres_with_texts_and_in_words():

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import resource
 import signal
 import subprocess
 import sys
-import threading
-import time
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +17,8 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from clock import PATIENCE_S, Clock
+from camera_objects import ASIDE, BASE, Led, Tape, played
+from clock import Clock
 from depth_files import write_depth_png, write_intrinsics
 from live_objects import (
     CAMERA,
@@ -31,44 +29,32 @@ from live_objects import (
     small_estimate,
     small_setting,
 )
-from recording_objects import PERIOD_NS, frame_number, record, update_number, write_bag
+from recording_objects import PERIOD_NS, frame_number, play, record, update_number, write_bag
+from tumortrack.core import store
 from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.evidence import Free, Held, Landmark, Outline, Touch
-from tumortrack.core.geometry import rigid
+from tumortrack.core.geometry import HERE, rigid
 from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.live.cameras import camera_setup
+from tumortrack.live.poses import FilePoses
 from tumortrack.live.values import (
     CameraView,
     Observation,
     PublishedFrame,
     SourceEnded,
-    SourceLost,
 )
+from tumortrack.report.inspection import describe
+from tumortrack.sense.camera import d405
 from tumortrack.sense.ply import write_cloud_ply
-from tumortrack_devices.recording.mcap import CHUNK_S
+from tumortrack_devices.recording.mcap import McapBag, camera_messages
+from tumortrack_devices.ros.messages import Messages
+from tumortrack_devices.sinks.recording import RecordingSinkConfig
 from tumortrack_devices.sinks.recording import RecordingSinkConfig as RecordTo
 from tumortrack_devices.sources.recording import RecordingSourceConfig
 
+LARGE = d405(848, 480)
 TURNED = PublishedFrame("table", rigid(np.diag([-1.0, -1.0, 1.0]), np.array([50.0, -20, 9])))
-
-
-def play(path: Path, **options) -> list[Observation | InputError]:
-    """Everything to the end, errors in their place."""
-    source = RecordingSourceConfig(path=path, **({"rate": 0} | options)).open()
-    got: list[Observation | InputError] = []
-    try:
-        while True:
-            try:
-                seen = source.read(0.2)
-            except InputError as error:
-                seen = error
-            if seen is not None:
-                got.append(seen)
-    except SourceEnded:
-        return got
-    finally:
-        source.close()
-        source.close()
 
 
 def stamps(got: list) -> list[int]:
@@ -122,15 +108,6 @@ def all_messages(bag: Path) -> list[tuple[str, bytes]]:
     return [(topic, b"" if "diagnostics" in topic else data) for topic, data in messages]
 
 
-def test_clouds_come_back(tmp_path):
-    points_mm = small_estimate().cloud.points_mm
-    cloud = SensorCloud(points_mm, STAMP_NS)
-    (seen,) = play(record(tmp_path / "r", [update_number(0, cloud)]))
-    assert seen.stamp_ns == STAMP_NS
-    np.testing.assert_allclose(seen.content.points_mm, points_mm, rtol=2e-7)
-    assert abs(seen.arrived_ns - time.time_ns()) < 600e9
-
-
 def test_evidence_comes_back_with_its_frame_and_its_camera_to_the_last_bit(tmp_path):
     place, many = (1 / 3, np.pi, 1e3 / 7), ((0.1, 0.2, 130.3), (1e-9, -2 / 3, 99.0))
     one = (
@@ -157,17 +134,14 @@ def test_evidence_comes_back_with_its_frame_and_its_camera_to_the_last_bit(tmp_p
 
 
 @pytest.mark.parametrize(
-    ("text", "wrong"),
+    "text",
     [
-        ("{", "truncated"),
-        ('{"stamp_ns": 1, "evidence": [{"kind": "smell"}]}', "smell"),
-        (
-            '{"stamp_ns": 1, "evidence": [{"kind": "touch", "place_mm": [0, 0, 1e9]}]}',
-            "reaches 1e\\+09; allowed: up to 2000",
-        ),
+        "{",
+        '{"stamp_ns": 1, "evidence": [{"kind": "smell"}]}',
+        '{"stamp_ns": 1, "evidence": [{"kind": "touch", "place_mm": [0, 0, 1e9]}]}',
     ],
 )
-def test_damaged_evidence_costs_its_frame_alone(text, wrong, tmp_path, monkeypatch):
+def test_damaged_evidence_costs_its_frame_alone(text, tmp_path, monkeypatch):
     updates = [update_number(n) for n in range(3)]
     updates[1] = replace(updates[1], evidence=(Free(places_mm=((0.0, 0.0, 90.0),)),))
     damaging = SimpleNamespace(json=SimpleNamespace(encode=lambda _: text.encode()))
@@ -176,7 +150,7 @@ def test_damaged_evidence_costs_its_frame_alone(text, wrong, tmp_path, monkeypat
     monkeypatch.undo()
     before, error, after = play(bad)
     assert (before.stamp_ns, after.stamp_ns) == (updates[0].stamp_ns, updates[2].stamp_ns)
-    assert re.search(rf"its /camera/evidence is damaged: .*{wrong}", str(error))
+    assert "/camera/evidence" in str(error)
 
 
 def test_an_mcap_is_read_by_rosbags_with_its_estimates(tmp_path):
@@ -214,90 +188,88 @@ def test_an_mcap_is_read_by_rosbags_with_its_estimates(tmp_path):
     np.testing.assert_allclose(np.abs([turn.x, turn.y, turn.z, turn.w]), [0, 0, 1, 0], atol=1e-12)
 
 
-def test_without_a_picture_there_are_estimates_only(tmp_path):
-    path = record(tmp_path / "r", [empty_update(0)])
-    with AnyReader([path]) as reader:
-        theirs = {name for name in reader.topics if not name.startswith("/tumortrack/")}
-        assert theirs == {"/tf", "/diagnostics"}
-    with pytest.raises(InputError, match="no depth images"):
-        RecordingSourceConfig(path=path).open()
-
-
-def test_an_existing_folder_is_never_written_into(tmp_path):
-    path = record(tmp_path / "mcap", [update_number(0)])
-    about = json.loads((path / "recording.json").read_text())
-    assert (about["kind"], about["parts"]) == ("recording", list(PARTS))
-    assert about["patient"] == {"id": "P1", "side": "left"}
-    (tmp_path / "other").mkdir()
-    for there in (path, tmp_path / "other", path / "recording.json"):
-        before = sorted(tmp_path.rglob("*"))
-        with pytest.raises(InputError, match="exists"):
-            record(there, [])
-        assert sorted(tmp_path.rglob("*")) == before
-    assert json.loads((path / "recording.json").read_text()) == about
-    assert len(play(path)) == 1
+def large(n: int) -> DepthFrame:
+    """Each of these ends a chunk of the file."""
+    depth_mm = np.full((480, 848), 120 + 0.1 * n, np.float32)
+    return DepthFrame(depth_mm, LARGE, STAMP_NS + n * PERIOD_NS)
 
 
 def test_a_file_cut_anywhere_gives_the_frames_before(tmp_path):
-    """As a killed program leaves it. Frames are those of the whole file, from the first on."""
-    sink = RecordTo(path=tmp_path / "r").open(small_setting())
-    ends = []
-    for n in range(6):
-        sink.publish(update_number(n))
-        sink._bag.flush()  # as time does
-        ends.append(sink._bag._whole)
-    sink.close()
-    raw = (tmp_path / "r" / "r.mcap").read_bytes()
+    """As a crash leaves it. Frames are those of the whole file, from the first on."""
+    path = record(tmp_path / "r", [update_number(n, large(n)) for n in range(5)])
+    raw = (path / "r.mcap").read_bytes()
     found, cut_file = [], tmp_path / "cut.mcap"
-    for size in range(len(raw) - 1, ends[0], -len(raw) // 30):
+    for size in range(len(raw) - 1, len(raw) * 9 // 20, -len(raw) // 15):
         cut_file.write_bytes(raw[:size])
         got = play(cut_file)
         assert stamps(got) == [STAMP_NS + n * PERIOD_NS for n in range(len(got))]
         assert got[-1].content.depth_mm[0, 0] == pytest.approx(120 + 0.1 * (len(got) - 1))
-        assert len(got) - sum(end <= size for end in ends) in (0, 1)  # its index may be cut off
+        assert len(got) >= int(5 * size / len(raw) - 0.2)
         found.append(len(got))
-    assert set(found) >= {6, 5, 4, 3, 2}
-    cut_file.write_bytes(raw[: ends[2]] + bytes(5000))  # a disk that filled the rest with zeros
-    assert len(play(cut_file)) == 3
-    cut_file.write_bytes(raw[: ends[0] // 2])
-    with pytest.raises(InputError, match="no depth images"):
+        cut_file.write_bytes(raw[:size] + bytes(5000))  # a disk that filled the rest with zeros
+        assert len(play(cut_file)) in (found[-1], found[-1] + 1)
+    assert set(found) >= {5, 4, 3, 2}
+    cut_file.write_bytes(raw[: len(raw) // 10])
+    with pytest.raises(InputError, match=r"cut\.mcap"):
         play(cut_file)
+    damaged, begins = bytearray(raw), [8]
+    while raw[begins[-1]] != 0x0F:  # https://mcap.dev/spec: opcode, length, content
+        size = int.from_bytes(raw[begins[-1] + 1 : begins[-1] + 9], "little")
+        begins.append(begins[-1] + 9 + size)
+    third = [begin for begin in begins if raw[begin] == 0x06][2]
+    damaged[third + 50 : third + 58] = b"\xff" * 8  # the length of the chunk's first record
+    cut_file.write_bytes(damaged)
+    got = play(cut_file)
+    assert isinstance(got[-1], InputError)
+    assert 0 < len(got) < 5
 
 
 CHILD = """
 import sys, time
 from pathlib import Path
-sys.path.insert(0, sys.argv[2])
-from recording_objects import RecordTo, small_setting, update_number
+sys.path[:0] = sys.argv[2:]
+from test_recording import RecordTo, large, small_setting, update_number
 sink = RecordTo(path=Path(sys.argv[1])).open(small_setting())
 for n in range(1000):
-    sink.publish(update_number(n))
-    print(n, time.monotonic(), flush=True)
+    sink.publish(update_number(n, large(n)))
+    print(n, flush=True)
     time.sleep(0.02)
 """
 
 
-def test_a_killed_recorder_loses_less_than_a_second(tmp_path):
-    here = str(Path(__file__).parents[2] / "tests" / "support")
-    command = [sys.executable, "-c", CHILD, str(tmp_path / "r"), here]
+def test_a_killed_recorder_loses_a_frame_at_most(tmp_path):
+    here = [str(Path(__file__).parent), str(Path(__file__).parents[2] / "tests" / "support")]
+    command = [sys.executable, "-c", CHILD, str(tmp_path / "r"), *here]
     with subprocess.Popen(command, stdout=subprocess.PIPE, start_new_session=True) as child:
-        lines = []
-        try:
-            for line in child.stdout:
-                lines.append(line.split())
-                if float(line.split()[1]) > float(lines[0][1]) + 1.5:
-                    break
-        finally:
-            os.killpg(child.pid, signal.SIGKILL)
-        lines += [line.split() for line in child.stdout]
+        for line in child.stdout:
+            if int(line) == 10:
+                os.killpg(child.pid, signal.SIGKILL)
     assert not (tmp_path / "r" / "metadata.yaml").exists()
     got = play(tmp_path / "r")
     assert stamps(got) == [STAMP_NS + n * PERIOD_NS for n in range(len(got))]
-    came_s = np.array([float(at_s) for _, at_s in lines])
-    lost_s = came_s[-1] - came_s[min(len(got), len(came_s) - 1)]
-    # A chunk ends with the first frame after its time; how far apart frames come is not its matter.
-    assert CHUNK_S < 1
-    assert lost_s <= CHUNK_S + np.diff(came_s).max()
+    assert len(got) >= 10
+
+
+def test_what_is_there_is_never_written_into_and_what_is_no_recording_is_refused(tmp_path):
+    path = record(tmp_path / "mcap", [update_number(0)])
+    about = json.loads((path / "recording.json").read_text())
+    assert (about["kind"], about["parts"]) == ("recording", list(PARTS))
+    assert about["patient"] == {"id": "P1", "side": "left"}
+    (tmp_path / "other").mkdir()
+    (tmp_path / "film.avi").touch()
+    for there in (path, tmp_path / "other", path / "recording.json"):
+        before = sorted(tmp_path.rglob("*"))
+        with pytest.raises(InputError, match=str(there)):
+            record(there, [])
+        assert sorted(tmp_path.rglob("*")) == before
+    assert len(play(path)) == 1
+    blind = record(tmp_path / "blind", [empty_update(0)])  # estimates only
+    for there in (blind, tmp_path / "other", tmp_path / "film.avi", tmp_path / "nowhere"):
+        with pytest.raises(InputError):
+            RecordingSourceConfig(path=there).open()
+    for options in ({"rate": -1}, {"rate": float("nan")}, {"fps": 0}, {"unit_mm": 0}):
+        with pytest.raises(InputError):
+            RecordingSourceConfig(path=tmp_path, **options)
 
 
 @contextmanager
@@ -316,20 +288,20 @@ def full_disk_at(size: int):
 def test_a_full_disk_is_said_and_leaves_what_was_whole(tmp_path):
     sink = RecordTo(path=tmp_path / "r").open(small_setting())
     said, written = [], 0
-    with full_disk_at(1_700_000):
-        for n in range(150):
+    with full_disk_at(5_000_000):
+        for n in range(12):
             try:
-                sink.publish(update_number(n))
+                sink.publish(update_number(n, large(n)))
                 written += 1
             except StorageError as error:
                 said.append(str(error))
         sink.close()
     assert len(set(said)) == 1
-    assert len(said) == 150 - written > 5
+    assert "File too large" in said[0]
+    assert len(said) == 12 - written > 5
     got = play(tmp_path / "r")
     assert stamps(got) == [STAMP_NS + n * PERIOD_NS for n in range(len(got))]
-    assert written > len(got) > 5
-    assert "File too large" in said[0]
+    assert written >= len(got) > 2
 
 
 def cloud_files(folder: Path, names: list[str]) -> Path:
@@ -357,14 +329,6 @@ def test_stamps_of_files(tmp_path):
     assert stamps(play(named)) == [1790000000000000500, 1790000000040000007]
     numbered = cloud_files(tmp_path / "m", ["000.ply", "001.ply"])
     assert np.diff(stamps(play(numbered, fps=4))) == [250_000_000]
-
-
-def test_clouds_in_metres(tmp_path):
-    folder = tmp_path / "m"
-    folder.mkdir()
-    np.savez(folder / "a.npz", points=np.array([[0.001, 0.002, 0.13]]))
-    (seen,) = play(folder, unit="m")
-    np.testing.assert_allclose(seen.content.points_mm, [[1, 2, 130]], rtol=1e-6)
 
 
 def test_depth_images_beside_one_camera(tmp_path):
@@ -419,7 +383,7 @@ def test_bags_of_every_kind_are_played(tmp_path, kind):
         (file,) = [p for p in path.iterdir() if p.suffix in (".mcap", ".db3")]
         assert stamps(play(file)) == stamps(frames)
     for options in ({"topic": "/nowhere"}, {"info_topic": "/arm/points"}):
-        with pytest.raises(InputError, match="has no"):
+        with pytest.raises(InputError, match=r"nowhere|points"):
             RecordingSourceConfig(path=path, **options).open()
 
 
@@ -453,51 +417,12 @@ def test_a_bad_image_in_a_bag_is_said_and_passed(tmp_path):
         assert said in str(got[1])
 
 
-def test_a_bag_damaged_in_the_middle_is_said_and_ends(tmp_path):
-    """A chunk whose own records do not add up: nothing behind it can be trusted."""
-    sink = RecordTo(path=tmp_path / "r").open(small_setting())
-    ends = []
-    for n in range(4):
-        sink.publish(update_number(n))
-        sink._bag.flush()
-        ends.append(sink._bag._whole)
-    sink.close()
-    path = tmp_path / "r" / "r.mcap"
-    raw = bytearray(path.read_bytes())
-    raw[ends[1] + 50 : ends[1] + 58] = b"\xff" * 8  # the length of the chunk's first record
-    path.write_bytes(raw)
-    got = play(tmp_path / "r")
-    assert [isinstance(seen, InputError) for seen in got[:3]] == [False, False, True]
-    assert len(got) == 3
-
-
-def test_a_bad_cloud_in_a_bag_is_said_and_passed(tmp_path):
-    clouds = [SensorCloud(np.float32([[n + 1, 2, 130]]), STAMP_NS + n) for n in range(3)]
-    path = write_bag(tmp_path / "d", {"/points": ("points", clouds)}, "mcap") / "d.mcap"
-    raw = path.read_bytes()
-    name = b"\x02\0\0\0y\0"  # of a field, in each message
-    begin = raw.find(name, raw.find(name) + 6)
-    path.write_bytes(raw[:begin] + b"\xff" * 4 + raw[begin + 4 :])
-    assert first_x(play(path)) == [1, None, 3]
-
-
 @pytest.mark.parametrize("name", ["r.mcap", "r.db3", "r.bag", "metadata.yaml"])
 def test_rubbish_is_no_recording(tmp_path, name):
     (tmp_path / name).write_bytes(np.random.default_rng(1).bytes(3000))
     path = tmp_path if name == "metadata.yaml" else tmp_path / name
     with pytest.raises(InputError, match="bag"):
         RecordingSourceConfig(path=path).open()
-
-
-def test_what_is_no_recording_is_refused(tmp_path):
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "film.avi").touch()
-    for path in (tmp_path / "empty", tmp_path / "film.avi", tmp_path / "nowhere"):
-        with pytest.raises(InputError):
-            RecordingSourceConfig(path=path).open()
-    for options in ({"rate": -1}, {"rate": float("nan")}, {"fps": 0}, {"unit_mm": 0}):
-        with pytest.raises(InputError):
-            RecordingSourceConfig(path=tmp_path, **options)
 
 
 @pytest.fixture
@@ -543,27 +468,6 @@ def test_a_long_pause_is_cut_short_of_a_frozen_source(tmp_path, clock):
     assert clock.monotonic() - start == pytest.approx(2.0, abs=1e-6)
 
 
-def test_close_ends_a_read_that_waits(tmp_path, monkeypatch):
-    monkeypatch.setattr("tumortrack_devices.sources.recording._LONGEST_WAIT_S", 10 * PATIENCE_S)
-    folder = cloud_files(tmp_path / "c", ["1000000000000.ply", "9000000000000.ply"])
-    source = RecordingSourceConfig(path=folder).open()
-    source.read(0)
-    threading.Timer(0.1, source.close).start()
-    start = time.monotonic()
-    with pytest.raises(SourceLost):
-        source.read(10 * PATIENCE_S)
-    assert time.monotonic() - start < PATIENCE_S
-
-
-def test_the_second_of_two_that_begin_to_record_into_one_folder_is_refused(tmp_path):
-    first = RecordTo(path=tmp_path / "tape").open(small_setting())
-    with pytest.raises(InputError, match="exists"):
-        RecordTo(path=tmp_path / "tape").open(small_setting())
-    first.publish(update_number(0))
-    first.close()
-    assert stamps(play(tmp_path / "tape")) == [frame_number(0).stamp_ns]
-
-
 @pytest.mark.parametrize(
     "published", [PublishedFrame(), PublishedFrame("base", np.diag([-1, -1, 1, 1.0]))]
 )
@@ -577,3 +481,66 @@ def test_a_recorded_bag_keeps_the_name_of_its_camera(tmp_path, published, name, 
     source.close()
     assert got is not None
     assert got.frame_id == kept
+
+
+def test_a_recording_of_a_moving_camera_keeps_its_poses(tmp_path):
+    published = PublishedFrame("base", HERE, calibrated=True, moves=True)
+    told, _ = played([Tape(0, 33, 66, 99)], Led(), published)
+    context = replace(small_setting(), published_frame=published)
+    sink = RecordingSinkConfig(path=tmp_path / "run").open(context)
+    for one in told:
+        sink.publish(one)
+    sink.close()
+    source = RecordingSourceConfig(path=tmp_path / "run", rate=0).open()
+    again, _ = played([source], FilePoses(tmp_path / "run" / "poses.csv"), published)
+    assert len(again) == 4
+    for one, other in zip(told, again, strict=True):
+        assert other.stamp_ns == one.stamp_ns
+        np.testing.assert_allclose(
+            other.published_frame.published_from_camera,
+            one.published_frame.published_from_camera,
+            atol=1e-5,
+        )
+
+
+def test_a_recording_of_several_cameras_is_played_as_several(tmp_path):
+    places = (BASE, BASE @ ASIDE)
+    told, _ = played([Tape(0, 33, 66), Tape(5, 38, 71, of=5.0)], places)
+    context = replace(small_setting(), published_frame=told[0].published_frame, cameras=places)
+    sink = RecordingSinkConfig(path=tmp_path / "run").open(context)
+    for one in told:
+        sink.publish(one)
+    sink.close()
+    topics = [f"/camera{n}/depth/image_rect" for n in ("", "_2")]
+    texts = [f"recording:{tmp_path / 'run'}?rate=0&topic={topic}" for topic in topics]
+    setup = camera_setup(texts, tmp_path / "run" / "poses.json", "", None)
+    assert setup.published.frame_id == "base"
+    np.testing.assert_allclose(setup.still, places, atol=1e-9)
+    again, _ = played([one.open() for one in setup.sources.values()], setup.still)
+    assert [one.cameras for one in again] == ["cameras 1, 2"] * 3
+    for one, other in zip(told, again, strict=True):
+        for mine, its in zip(one.views, other.views, strict=True):
+            assert mine.seen.stamp_ns == its.seen.stamp_ns
+            np.testing.assert_allclose(
+                its.seen.content.depth_mm, mine.seen.content.depth_mm, atol=0.06
+            )
+
+
+@pytest.mark.parametrize("ended", [True, False])
+def test_a_recording_its_length_rate_and_whether_its_depths_were_corrected(tmp_path, ended):
+    """Also one without its end, as a killed recorder leaves it."""
+    folder, messages = tmp_path / "seen", Messages()
+    bag = McapBag(folder, messages, "")
+    for n in range(12):  # the last one ends a chunk
+        depth = DepthFrame(np.full((240, 424), 150.0, np.float32), d405(424, 240), 10**18 + n)
+        seen = Observation(depth, 10**18 + n * 10**8)
+        bag.write(seen.arrived_ns, camera_messages(seen, HERE, "camera", messages))
+    if ended:
+        bag.close()
+    patient = {"id": "P1", "side": "left"}
+    store.write_json(folder / "recording.json", {"patient": patient, "corrected": True})
+    said = "\n".join(describe(folder if ended else folder / "seen.mcap"))
+    assert "a recording of 1.1 s" in said
+    assert "/camera/depth/image_rect: 12 frames, 10.0 a second" in said
+    assert "patient P1, side left" in said
+    assert "its depths were corrected" in said

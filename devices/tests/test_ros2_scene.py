@@ -21,7 +21,7 @@ from PIL import Image
 import clients
 import needs
 import tumortrack
-from clock import PATIENCE_S, until
+from clock import PATIENCE_S, Clock, until
 from live_objects import PARTS, ball, empty_update, small_setting, small_update
 from reports import NOWHERE, reporting
 from ros2_objects import RCLPY, own_graph, peer, process
@@ -32,9 +32,9 @@ from tumortrack.core.geometry import rigid
 from tumortrack.core.types import Mesh
 from tumortrack.live.spec import SINKS
 from tumortrack.live.values import PublishedFrame, TrackingResult
+from tumortrack_devices.ros.bus import open_bus
 from tumortrack_devices.ros.messages import Messages
 from tumortrack_devices.ros.results import ResultMessages
-from tumortrack_devices.ros.ros2 import open_bus
 from tumortrack_devices.ros.sensors import COMPRESSED, image_of
 from tumortrack_devices.ros.tf import TRANSFORMS, pose_of
 from tumortrack_devices.sinks.moveit import SCENE, coarser, widened_hull
@@ -61,7 +61,10 @@ def test_each_part_has_a_frame_turned_as_the_organ_is():
     turned = rigid(np.diag([1.0, -1, -1]), np.zeros(3))
     motion = {**NOWHERE, "camera_from_ct": turned.tolist()}
     known = estimate_with(update, {"artery": ball((1, 2, 130), 3)}, motion=motion)
-    update = replace(update, estimate=known)
+    vessel = {"vessel": ball((0.0, 0.0, 125.0), 3.0)}
+    update = replace(update, estimate=replace(known, structures=vessel))
+    out = sent(ResultMessages(MESSAGES, small_setting()), update)["meshes"].markers
+    assert [one.ns for one in out] == [*PARTS, "artery", "vessel", "quality"]
     frames = sent(ResultMessages(MESSAGES, small_setting(), namespace="/or_2"), update)["/tf"]
     assert [one.child_frame_id for one in frames.transforms] == [
         f"or_2/{name}" for name in (*PARTS, "artery")
@@ -78,16 +81,11 @@ def test_tf_is_silent_where_the_estimate_is_not_good():
     assert [len(sent(results, one)["/tf"].transforms) for one in (poor, empty_update())] == [0, 0]
 
 
-def test_further_surfaces_are_shown_as_the_parts_are():
-    update = small_update()
-    update = replace(update, estimate=estimate_with(update, {"artery": ball((1, 2, 130), 3)}))
-    markers = sent(ResultMessages(MESSAGES, small_setting()), update)["meshes"].markers
-    assert [one.ns for one in markers] == [*PARTS, "artery", "quality"]
-
-
-def test_diagnostics_come_each_second_and_at_once_where_the_level_changes():
+def test_diagnostics_come_each_second_and_at_once_where_the_level_changes(
+    monkeypatch,
+):
+    monkeypatch.setattr("tumortrack_devices.network.time", Clock())
     results = ResultMessages(MESSAGES, small_setting())
-    results._status_rate._period_s = 1000.0  # whatever the machine's load
     updates = [small_update(0), small_update(1), empty_update(2), empty_update(3), small_update(4)]
     came = [sent(results, one).get("/diagnostics") for one in updates]
     assert [None if one is None else one.status[0].level for one in came] == [0, None, 2, None, 0]
@@ -131,7 +129,7 @@ def test_packed_depths_are_those_that_were_packed():
 def test_other_packings_and_damaged_ones_are_refused(kind, cut):
     message = packed(np.ones((20, 30), np.uint16), kind)
     message.data = message.data[: cut or None]
-    with pytest.raises(InputError, match="packed"):
+    with pytest.raises(InputError):
         image_of(message, MESSAGES)
 
 
@@ -176,18 +174,8 @@ def test_the_scene_s_options_are_checked():
     assert SINKS.parse("moveit").topic == "/planning_scene"
     with pytest.raises(InputError, match="margin_mm"):
         SINKS.parse("moveit:/planning_scene?margin_mm=-1")
-    with pytest.raises(InputError, match="no full topic name"):
+    with pytest.raises(InputError, match="scene"):
         SINKS.parse("moveit:scene")
-
-
-def test_moveit_s_types_are_those_that_a_second_library_makes():
-    needs.module("cyclonedds", "tumortrack-devices, x86-64, Python up to 3.13")
-    from tumortrack_devices.ros.dds import idl_type
-
-    scene = MESSAGES.make(SCENE, name="theatre", is_diff=True, robot_state={"is_diff": True})
-    cdr = bytes(MESSAGES.to_bytes(scene))
-    type_ = idl_type(SCENE)
-    assert type_.deserialize(cdr).serialize(use_version_2=False)[: len(cdr)] == cdr
 
 
 def test_obstacles_arrive_of_good_estimates_and_cameras_are_kept_for_latecomers():
@@ -264,22 +252,8 @@ def test_parameters_are_options_of_track_and_have_their_defaults(options):
     for name, option in options.OPTIONS.items():
         if name not in ("executable", "model", "source", "sinks"):
             assert (getattr(plain, name) or "") == (option.default or ""), name
-    with pytest.raises(ValueError, match="source is not set"):
+    with pytest.raises(ValueError, match="source"):
         options.command({"model": "MODEL"})
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"stale": -5.0}, {"stale": 0.0}, {"stale": float("nan")}, {"give_up": -1.0},
-        {"rescan": 0.0}, {"smoothing": -0.1}, {"seconds": -1.0}, {"device": "abacus"},
-        {"side": "up"}, {"range": "100"}, {"range": "near far"}, {"box": "1 2 3"},
-        {"range": "100 1e99"},
-    ],
-)  # fmt: skip
-def test_a_parameter_out_of_its_limits_is_refused(options, wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        options.command({"model": "MODEL", "source": "ros2:/depth"} | wrong)
 
 
 def test_a_parameter_that_tracking_refuses_is_set_back_and_it_goes_on(tmp_path):

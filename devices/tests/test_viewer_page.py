@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import signal
 import socket
 import subprocess
@@ -250,67 +249,37 @@ GIVEN = ("PICTURES", "DEMO", "PLAN")
 PICTURES, DEMO, PLAN = (os.environ.get(f"TUMORTRACK_{name}") for name in GIVEN)
 
 
-@pytest.mark.skipif(not (PICTURES and DEMO), reason="TUMORTRACK_PICTURES, TUMORTRACK_DEMO not set")
-def test_pictures_for_the_documentation(tmp_path):
-    """TUMORTRACK_PICTURES: where pictures go; TUMORTRACK_DEMO: what ``tumortrack demo`` left. The
-    command itself, on a case in motion; then its process is stopped, as a hung machine would be."""
-    assert PICTURES
-    assert DEMO
-    demo, port = Path(DEMO).resolve(), free_port()
-    command = [*COMMAND, "track", demo / "case", f"virtual:{demo / 'case'}"]
-    process = subprocess.Popen(
-        [*map(str, command), f"viewer:{port}?case={demo / 'case'}"],
-        env=environment(),
-        cwd=tmp_path,
-    )
-    try:
-        with Browser(1280, 800) as browser:
-            until(lambda: answers(port), "the viewer")
-            browser.open(f"http://127.0.0.1:{port}")
-            until(lambda: "GOOD" in browser.text(), "an estimate")
-            time.sleep(8)
-            until(lambda: save_good(browser, "viewer.png"), "a picture of a good estimate")
-            process.send_signal(signal.SIGSTOP)
-            time.sleep(4)
-            save(browser, "viewer_stale.png")
-    finally:
-        process.kill()
-        process.wait()
-
-
-@pytest.mark.skipif(not (PICTURES and DEMO and PLAN), reason="TUMORTRACK_PLAN and more not set")
-def test_picture_of_a_resection_for_the_documentation(tmp_path):
-    """TUMORTRACK_PLAN: what ``tumortrack plan`` made of the demo's phantom."""
+@pytest.mark.skipif(not (PICTURES and DEMO and PLAN), reason="TUMORTRACK_PICTURES and more not set")
+@pytest.mark.parametrize("of", ["tracking", "resection"])
+def test_pictures_for_the_documentation(of, tmp_path):
+    """TUMORTRACK_PICTURES: where pictures go; TUMORTRACK_DEMO: what ``tumortrack demo`` left;
+    TUMORTRACK_PLAN: what ``tumortrack plan`` made of its phantom. The command itself, on a case in
+    motion; then its process is stopped, as a hung machine would be."""
     demo, plan = (Path(str(one)).resolve() for one in (DEMO, PLAN))
-    port = free_port()
-    command = live_resection(demo, plan, f"viewer:{port}")
-    said = tmp_path / "said.txt"
-    with said.open("w") as told:
-        process = subprocess.Popen(command, env=environment(), cwd=tmp_path, stdout=told)
-    try:
-        with Browser(1280, 800) as browser:
-            until(lambda: f":{port}/" in said.read_text(), "the viewer's address")
-            address = re.search(rf"http://\S+:{port}/[\w-]+", said.read_text())
-            assert address  # with the token: without it a page may change nothing
-            browser.open(address[0])
-            until(lambda: "ARMS: sweep 2" in browser.text(), "the second sweep", 200)
-            browser.click_text("organ")
-            time.sleep(3)
-            save(browser, "viewer_resection.png")
-    finally:
-        process.kill()
-        process.wait()
-
-
-def answers(port: int) -> bool:
-    with socket.socket() as one:
-        return one.connect_ex(("127.0.0.1", port)) == 0
-
-
-def free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    case, viewer = demo / "case", f"viewer:{port}"
+    track = [*COMMAND, "track", case, f"virtual:{case}", f"{viewer}?case={case}"]
+    command = track if of == "tracking" else live_resection(demo, plan, viewer)
+    with subprocess.Popen([*map(str, command)], env=environment(), cwd=tmp_path) as process:
+        try:
+            with Browser(1280, 800) as browser:
+                until(lambda: socket.socket().connect_ex(("127.0.0.1", port)) == 0, "the viewer")
+                browser.open(f"http://127.0.0.1:{port}")
+                if of == "resection":
+                    until(lambda: "ARMS: sweep 2" in browser.text(), "the second sweep", 200)
+                    browser.click_text("organ")
+                    time.sleep(3)
+                    save(browser, "viewer_resection.png")
+                    return
+                until(lambda: "GOOD" in browser.text(), "an estimate")
+                time.sleep(8)
+                until(lambda: save_good(browser, "viewer.png"), "a picture of a good estimate")
+                process.send_signal(signal.SIGSTOP)
+                time.sleep(4)
+                save(browser, "viewer_stale.png")
+        finally:
+            process.kill()
 
 
 def save_good(browser: Browser, name: str) -> bool:

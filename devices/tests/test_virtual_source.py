@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import fields
 from itertools import pairwise
 
@@ -14,7 +13,7 @@ from clock import Clock
 from elastic_objects import UP, organ
 from render_objects import ray_hits
 from theatre_objects import COARSE, small_theatre
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import LabelVolume, Mesh
 from tumortrack.imaging.case import Case, save_case
@@ -23,6 +22,7 @@ from tumortrack.sense.noise import CLEAN
 from tumortrack.sense.sensors import simulated
 from tumortrack.simulate.elastic.body import BodyConfig
 from tumortrack_devices.player import SHAFT_MM, ScenePlayer, ScenePlayerConfig, rod
+from tumortrack_devices.pulled import PulledStates
 from tumortrack_devices.sources.virtual import VirtualSource, VirtualSourceConfig
 
 HELD_S = (3.0, 9.0, 15.0)  # a push is at its deepest
@@ -197,20 +197,14 @@ def test_parts_can_be_left_out():
     assert truth.organ.vertices_mm[:, 2].min() == pytest.approx(118.0, abs=1e-3)
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [{"distance_mm": 10.0}, {"distance_mm": 500.0}, {"width": 100}],
-)
-def test_impossible_rooms_are_refused(wrong: dict):
-    with pytest.raises(InputError):
-        ScenePlayerConfig(**wrong)
-
-
-def test_too_many_places_and_times_before_the_beginning_are_refused():
+def test_rooms_and_times_that_cannot_be_are_refused():
+    for wrong in ({"distance_mm": 10.0}, {"distance_mm": 500.0}, {"width": 100}):
+        with pytest.raises(InputError):
+            ScenePlayerConfig(**wrong)
     few = BodyConfig(cells=100, modes=8, responses=20, patches=20)
-    with pytest.raises(InputError, match=r"ask for fewer"):
+    with pytest.raises(InputError, match="20"):
         ScenePlayer(organ(), UP, ScenePlayerConfig(body=few, places=20), 3)
-    with pytest.raises(InputError, match=r"before the scene's beginning"):
+    with pytest.raises(InputError, match=r"-0\.1"):
         small_theatre().state_at(-0.1)
 
 
@@ -222,25 +216,6 @@ def test_frames_missed_are_counted(monkeypatch):
     clock.sleep(0.31)  # frame 15 is due, 1 to 14 were
     assert source.read(1.0) is not None
     assert source.dropped == 14
-
-
-def test_a_frame_is_not_given_before_its_time():
-    source = VirtualSource(small_theatre(), fps=0.001)
-    assert source.read(0.0) is not None
-    begin = time.monotonic()
-    assert source.read(0.0) is None
-    assert source.read(0.05) is None
-    assert time.monotonic() - begin >= 0.05
-    assert source.dropped == 0
-    source.close()
-
-
-def test_truth_is_of_the_frames_own_instant():
-    source = VirtualSource(small_theatre(), fps=30)
-    seen = source.at(4.25, stamp_ns=99)
-    again = source.player.truth(source.player.state_at(4.25))
-    assert seen.stamp_ns == 99
-    np.testing.assert_array_equal(seen.truth.organ.vertices_mm, again.organ.vertices_mm)
 
 
 def test_another_camera_looks_from_farther_and_keeps_its_frozen_noise():
@@ -282,3 +257,63 @@ def test_the_command_lines_text_opens_a_case(tmp_path):
     for wrong in ({"fps": 0.0}, {"seed": -1}):
         with pytest.raises(InputError):
             VirtualSourceConfig(case=tmp_path, **wrong)
+
+
+QUIET = {"breath_mm": 0.0, "swell": 0.0, "sway_mm": 0.0, "sway_degrees": 0.0, "push_mm": 0.0}
+PULLS_MM = np.array([0.0, 2.0, 4.0])
+
+
+def vertices():
+    return np.concatenate([part.vertices_mm for part in organ().parts])
+
+
+def states(count=None):
+    """Everything goes along x by 0, 1, 4 mm, and the second vertex alone along y."""
+    moved = np.zeros((3, count or len(vertices()), 3))
+    moved[:, :, 0] = np.array([0.0, 1.0, 4.0])[:, None]
+    moved[:, 1, 1] = PULLS_MM
+    return PulledStates("c" * 64, PULLS_MM, moved)
+
+
+def test_states_come_back_from_their_file_and_lie_between_each_other(tmp_path):
+    made = states()
+    made.write(tmp_path / "pulled.safetensors")
+    read = PulledStates.read(tmp_path / "pulled.safetensors")
+    assert read.case_sha256 == made.case_sha256
+    for pull_mm, moved_mm in zip(PULLS_MM.tolist(), made.moved_mm, strict=True):
+        np.testing.assert_allclose(read.at(pull_mm), moved_mm, atol=1e-12)
+    assert read.at(1.0)[1, 1] == pytest.approx(1.0)  # linear stays linear
+    assert 0 < read.at(1.0)[0, 0] < 1 < read.at(3.0)[0, 0] < 4
+    np.testing.assert_array_equal(read.at(60.0), read.at(4.0))  # as at the lift
+    np.testing.assert_array_equal(read.at(-1.0), read.at(0.0))
+
+
+def test_what_holds_no_states_is_refused(tmp_path):
+    path = tmp_path / "pulled.safetensors"
+    with pytest.raises(ArtifactError, match="make pull"):
+        PulledStates.read(path)
+    path.write_bytes(b"nothing")
+    with pytest.raises(ArtifactError, match="make pull"):
+        PulledStates.read(path)
+    PulledStates("c" * 64, PULLS_MM[::-1].copy(), np.zeros((3, 4, 3))).write(path)
+    with pytest.raises(ArtifactError, match=r"pulled\.safetensors"):
+        PulledStates.read(path)
+
+
+def test_the_room_shows_the_pull_of_the_moment():
+    config = ScenePlayerConfig(body=COARSE, **QUIET)
+    room, bare = (ScenePlayer(organ(), UP, config, 3, pulled) for pulled in (states(), None))
+    source = VirtualSource(room, 10.0)
+    still = source.at(1.0, 7).truth.organ.vertices_mm
+    np.testing.assert_array_equal(still, bare.truth(bare.state_at(1.0), 4.0).organ.vertices_mm)
+    source.pull_mm = lambda: 4.0
+    pulled = source.at(1.0, 7)
+    ct_from_camera = np.linalg.inv(room.state_at(1.0).camera_from_room)
+    both = still, pulled.truth.organ.vertices_mm
+    here, there = (transform_points(ct_from_camera, vertices_mm) for vertices_mm in both)
+    np.testing.assert_allclose((there - here)[0], [4.0, 0.0, 0.0], atol=1e-3)
+    np.testing.assert_allclose((there - here)[1], [4.0, 4.0, 0.0], atol=1e-3)
+    unpulled = VirtualSource(bare, 10.0).at(1.0, 7).content.depth_mm
+    assert np.nanmax(np.abs(pulled.content.depth_mm - unpulled)) > 1.0  # and the camera sees it
+    with pytest.raises(InputError):
+        ScenePlayer(organ(), UP, config, 3, states(5))

@@ -5,26 +5,21 @@ from __future__ import annotations
 import socket
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from clock import until
 from igtl_objects import IgtlStatus, hear_all, status_by_the_book
 from live_objects import small_setting, small_update
-from recording_objects import frame_number
 from tumortrack.core.geometry import rigid, transform_points
-from tumortrack.live.values import Observation, RigidShape, SinkContext, SourceEnded, TrackingResult
+from tumortrack.live.values import RigidShape, SinkContext, TrackingResult
 from tumortrack_devices.igtl.message import unpack_transform
 from tumortrack_devices.ros.messages import Messages, stamp_of
 from tumortrack_devices.ros.results import ResultMessages
 from tumortrack_devices.ros.sensors import cloud_of
 from tumortrack_devices.sinks.openigtlink import OpenIgtLinkSinkConfig
-from tumortrack_devices.sinks.recording import RecordingSinkConfig as RecordTo
-from tumortrack_devices.sources.recording import RecordingSourceConfig
 from workcell_objects import CUT, REASON, TABLE, virtual, with_arms, workcell, working
 
 HUMBLE = Messages("humble")
@@ -140,38 +135,12 @@ def test_what_the_camera_saw_is_sent_in_the_frame_of_the_arms():
     assert np.sort(points_mm[:, 2]) == pytest.approx(
         np.sort(160 - depth_mm[np.isfinite(depth_mm)]), abs=1e-3
     )
+    arms = {"workcell", "joint_states", "observed", "planned"}
+    assert not arms & sent(update, ResultMessages(HUMBLE, small_setting())).keys()
     slow = ResultMessages(HUMBLE, with_arms(), hz=0.01)
     assert "observed" in sent(update, slow)
     assert "observed" not in sent(update, slow)
     assert sent(virtual(), slow)["observed"].width == 0
-
-
-def test_without_arms_nothing_of_them_is_announced():
-    topics = {out.suffix for out in ResultMessages(HUMBLE, small_setting()).of(working())}
-    assert not topics & {"workcell", "joint_states", "observed"}
-
-
-# Recordings
-
-
-def record(path: Path, updates: list[TrackingResult], **options) -> Path:
-    sink = RecordTo(path=path, **options).open(with_arms())
-    for update in updates:
-        sink.publish(update)
-    sink.close()
-    return path
-
-
-def played(path: Path) -> list[Observation]:
-    source, got = RecordingSourceConfig(path=path, rate=0).open(), []
-    try:
-        while True:
-            if seen := source.read(0.2):
-                got.append(seen)
-    except SourceEnded:
-        return got
-    finally:
-        source.close()
 
 
 def test_what_neither_moves_nor_deforms_is_sent_once_and_kept_for_latecomers():
@@ -199,35 +168,6 @@ def test_what_neither_moves_nor_deforms_is_sent_once_and_kept_for_latecomers():
         assert not set(names[1:]) & set(moving)
     (gone,) = out(3)["planned"].message.markers
     assert gone.action == gone.DELETEALL
-
-
-def three() -> list[TrackingResult]:
-    """With an estimate, without one, and without a camera's picture."""
-    frames = [frame_number(n) for n in (0, 1)]
-    seen = [Observation(frame, frame.stamp_ns) for frame in frames]
-    one = replace(working(0, 0.1), observation=seen[0], stamp_ns=frames[0].stamp_ns)
-    two = replace(virtual(1, 0.2, "stale"), observation=seen[1], stamp_ns=frames[1].stamp_ns)
-    return [one, two, less(virtual(2, 0.3), "table")]
-
-
-def test_an_mcap_holds_the_arms_and_plays_again(tmp_path):
-    path = record(tmp_path / "r", three(), meshes_hz=0.0)
-    with AnyReader([path]) as reader:
-        said: dict[str, list] = {}
-        for connection, _, raw in reader.messages():
-            message = reader.deserialize(raw, connection.msgtype)
-            said.setdefault(connection.topic, []).append(message)
-    joints = [m.position[0] for m in said["/tumortrack/joint_states"]]
-    assert joints == pytest.approx([0.02, 0.04, 0.06])
-    markers = [[m.ns for m in one.markers] for one in said["/tumortrack/workcell"]]
-    assert markers[0] == [*NAMES, "cut/1", "cut/2", "state"]
-    assert markers[2][0] == "table"  # its deletion
-    assert said["/tumortrack/workcell"][2].markers[0].action == 2
-    assert "/tumortrack/observed" not in said  # the picture itself is there
-    assert [seen.stamp_ns for seen in played(path)] == [u.stamp_ns for u in three()[:2]]
-
-
-# OpenIGTLink
 
 
 @pytest.fixture
@@ -270,13 +210,3 @@ def test_tips_and_the_arms_state_go_to_slicer(slicer):
     heard = hear_all(receiver, 4 + 1)
     assert status_by_the_book(heard["STATUS", "arms"].content).code == 16
     assert "TRANSFORM" not in {kind for kind, _ in heard}
-
-
-def test_without_arms_slicer_hears_nothing_of_them(slicer):
-    sink, receiver = slicer(small_setting())
-    sink.publish(working())
-    sink.close()
-    heard = hear_all(receiver, 4)
-    with pytest.raises((EOFError, ConnectionError)):
-        heard |= hear_all(receiver, 100)
-    assert not [device for _, device in heard if device == "arms" or "tip" in device]

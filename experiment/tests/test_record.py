@@ -21,7 +21,6 @@ from tumortrack.core.errors import InputError
 from tumortrack.live.poses import COLUMNS
 from tumortrack.live.spec import SOURCES
 from tumortrack.live.values import SourceEnded
-from tumortrack_devices.recording import mcap
 from tumortrack_experiment.record.attachments import attachments_of
 from tumortrack_experiment.record.folder import RecordingFolder
 from tumortrack_experiment.record.read import WHOLE, read_recorded
@@ -215,7 +214,7 @@ def test_poses_of_a_moving_camera_come_back(tmp_path):
 def test_a_full_disk_is_one_error_and_costs_no_state(tmp_path, monkeypatch, capsys):
     def refused() -> None:
         with monkeypatch.context() as full:
-            full.setattr(mcap._WholeWrites, "write", no_room)
+            full.setattr("rosbags.rosbag2.Writer.write", no_room)
             assert record(tmp_path) == 2
         said = capsys.readouterr().err
         assert "No space left on device. What is finished stays. Free some" in said

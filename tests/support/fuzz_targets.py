@@ -224,12 +224,11 @@ def _wire() -> dict[str, Target]:
         content, _ = igtl_messages.unpack_body(header, data[1:])
         getattr(igtl_messages, f"unpack_{kinds[data[0] % 4]}")(content)
 
-    surface = igtl_messages.Polydata(np.ones((3, 3)), np.array([[0, 1, 2]]))
     contents = (
         igtl_messages.pack_transform(np.eye(4)),
         b"\0\3\0\1" + b"1",
         igtl_messages.pack_points(np.ones((2, 3)), ["a", "b"], [(1, 2, 3)] * 2),
-        igtl_messages.pack_polydata(surface),
+        igtl_messages.pack_polydata(np.ones((3, 3)), np.array([[0, 1, 2]])),
     )
     bodies = [
         bytes([n]) + pack(Message("X", "x", 1, content, {"k": "v"}))[HEADER_SIZE:]

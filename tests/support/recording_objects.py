@@ -11,12 +11,14 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from live_objects import STAMP_NS, small_frame, small_setting, small_update
+from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live import values as live
-from tumortrack.live.values import Observation
+from tumortrack.live.values import Observation, SourceEnded
 from tumortrack_devices.ros.messages import Messages
 from tumortrack_devices.ros.sensors import messages_seen
 from tumortrack_devices.sinks.recording import RecordingSinkConfig as RecordTo
+from tumortrack_devices.sources.recording import RecordingSourceConfig
 
 PERIOD_NS = 40_000_000
 
@@ -68,3 +70,22 @@ def write_bag(path: Path, topics: dict[str, tuple[str, list[Any]]], kind: str) -
                 )
             writer.write(connections[topic], stamp_ns, messages.to_bytes(out.message))
     return path
+
+
+def play(path: Path, **options: Any) -> list[Observation | InputError]:
+    """Everything to the end, errors in their place."""
+    source = RecordingSourceConfig(path=path, **({"rate": 0} | options)).open()
+    got: list[Observation | InputError] = []
+    try:
+        while True:
+            try:
+                seen = source.read(0.2)
+            except InputError as error:
+                seen = error
+            if seen is not None:
+                got.append(seen)
+    except SourceEnded:
+        return got
+    finally:
+        source.close()
+        source.close()

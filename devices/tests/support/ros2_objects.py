@@ -22,8 +22,7 @@ from live_objects import PARTS, small_anatomy, small_frame
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import SensorCloud
 from tumortrack.live.values import Observation, Source
-from tumortrack_devices.ros.bus import Bus
-from tumortrack_devices.ros.ros2 import open_bus
+from tumortrack_devices.ros.bus import Bus, open_bus
 from tumortrack_devices.ros.sensors import messages_seen
 
 HERE = Path(__file__).parent
@@ -59,7 +58,7 @@ class Frames:
                 continue
             if suffix not in self._publishers:
                 self._publishers[suffix] = self._bus.publisher(f"{self.place}/{suffix}", kind)
-            self._publishers[suffix].publish(self._messages.to_bytes(message))
+            self._publishers[suffix](self._messages.to_bytes(message))
 
 
 @contextmanager

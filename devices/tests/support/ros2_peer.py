@@ -13,10 +13,12 @@ import json
 import signal
 import sys
 import time
-from unittest import mock
 
 import numpy as np
-from cyclonedds.qos import Policy
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
 from scipy.spatial.transform import Rotation
 
 from live_objects import empty_update, small_frame, small_setting
@@ -24,11 +26,10 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.values import Observation
-from tumortrack_devices.ros.bus import Publisher
-from tumortrack_devices.ros.dds import DdsBus
+from tumortrack_devices.ros.bus import Publish, open_bus
+from tumortrack_devices.ros.dds import domain_id, idl_type
 from tumortrack_devices.ros.messages import stamp_of
 from tumortrack_devices.ros.results import DIAGNOSTICS, MARKERS, ResultMessages
-from tumortrack_devices.ros.ros2 import open_bus
 from tumortrack_devices.ros.sensors import CAMERA_INFO, CLOUD, messages_seen, plain_cloud
 from tumortrack_devices.ros.tf import TRANSFORMS
 from tumortrack_devices.sources.ros import Ros2SourceConfig
@@ -69,7 +70,7 @@ def send(kind: str, hz: float, seconds: float) -> None:
             if suffix not in publishers:
                 kept = message_type == CAMERA_INFO
                 publishers[suffix] = bus.publisher(f"/camera/{suffix}", message_type, kept)
-            publishers[suffix].publish(messages.to_bytes(message))
+            publishers[suffix](messages.to_bytes(message))
         number += 1
         time.sleep(max(0.0, 1 / hz - (time.time_ns() - start_ns) * 1e-9))
     bus.close()
@@ -85,16 +86,10 @@ def tool_pose(stamp_ns: int) -> np.ndarray:
 def transforms(hz: float, seconds: float) -> None:
     """The camera on the tool, said once and kept; then the tool."""
     bus = open_bus("dds")
-    endpoint, kept = bus._endpoint, Policy.Durability.TransientLocal
-
-    def keeping(topic: str, kind: str, reliability: object, _: object, most: int) -> object:
-        return endpoint(topic, kind, reliability, kept, most)
-
-    with mock.patch.object(bus, "_endpoint", keeping):
-        static = bus.publisher("/tf_static", TRANSFORMS)
+    static = bus.publisher("/tf_static", TRANSFORMS, latched=True)
     moving, end_s = bus.publisher("/tf", TRANSFORMS), time.monotonic() + seconds
 
-    def send(publisher: Publisher, stamp_ns: int, parent: str, child: str, way: np.ndarray) -> None:
+    def send(publish: Publish, stamp_ns: int, parent: str, child: str, way: np.ndarray) -> None:
         x, y, z, w = Rotation.from_matrix(way[:3, :3]).as_quat().tolist()
         transform = {
             "header": bus.messages.header(stamp_ns, parent),
@@ -105,7 +100,7 @@ def transforms(hz: float, seconds: float) -> None:
             },
         }
         message = bus.messages.make(TRANSFORMS, transforms=[transform])
-        publisher.publish(bus.messages.to_bytes(message))
+        publish(bus.messages.to_bytes(message))
 
     send(static, 1, "tool0", "optical", TOOL_FROM_CAMERA)
     print(json.dumps({"static": True}), flush=True)
@@ -120,7 +115,10 @@ def hear(seconds: float) -> None:
     """Writes a line as soon as it listens, and one for every message."""
     bus = open_bus("dds")
     messages = bus.messages
-    _reliable = reliably(bus)
+    # A second reader of the cloud, whose writer has to wait for its acknowledgements.
+    reliable, volatile = Policy.Reliability.Reliable(0), Policy.Durability.Volatile
+    topic = Topic(member := DomainParticipant(domain_id()), "rt/tumortrack/cloud", idl_type(CLOUD))
+    _held = DataReader(member, topic, Qos(reliable, volatile, Policy.History.KeepLast(1)))
     out = ResultMessages(messages, small_setting()).of(empty_update())
     kinds = {sent.suffix: sent.message_type for sent in out if not sent.suffix.startswith("/")}
     heard = {name: bus.subscriber(f"/tumortrack/{name}", kind) for name, kind in kinds.items()}
@@ -150,16 +148,6 @@ def see(topic: str) -> None:
         if seen is not None:
             sum_mm = float(np.nansum(seen.content.depth_mm))
             print(json.dumps({"stamp_ns": seen.stamp_ns, "sum_mm": sum_mm}), flush=True)
-
-
-def reliably(bus: DdsBus) -> object:
-    """A second reader of the cloud, whose writer has to wait for its acknowledgements."""
-    from cyclonedds.sub import DataReader
-
-    reliable, volatile = Policy.Reliability.Reliable(0), Policy.Durability.Volatile
-    return DataReader(
-        bus._readers, *bus._endpoint("/tumortrack/cloud", CLOUD, reliable, volatile, 1)
-    )
 
 
 def content_of(message: object, kind: str) -> dict:

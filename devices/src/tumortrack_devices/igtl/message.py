@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int, Num
@@ -35,14 +35,14 @@ _ATTRIBUTE = struct.Struct("> B B I")
 _POINT_SCALARS = 0x00
 _POINT = struct.Struct("> 64s 32s 4B 4f 20s")
 _NOT_RIGID = 1e-3  # deviation of a rotation from orthonormal: float32 of some trackers' matrices
+_NO_SEGMENTS = np.zeros((0, 2), np.int32)
 
 
 class ProtocolError(InputError):
     """Bytes that are no message, or a message that does not fit the protocol."""
 
 
-@dataclass(frozen=True)
-class Message:
+class Message(NamedTuple):
     """``type``: TRANSFORM, STATUS, POLYDATA, GET_STATUS, ..., at most 12 ASCII characters;
     ``device``: at most 20. ``stamp_ns``: since 1970, UTC; 0: unknown. Kept to 1/4 ns. ``content``:
     the type's own bytes. ``metadata``: texts by name."""
@@ -51,11 +51,10 @@ class Message:
     device: str
     stamp_ns: int = 0
     content: bytes = b""
-    metadata: Mapping[str, str] = field(default_factory=dict)
+    metadata: Mapping[str, str] = {}
 
 
-@dataclass(frozen=True)
-class Header:
+class Header(NamedTuple):
     """The first 58 bytes; ``body_size`` bytes follow."""
 
     version: int
@@ -153,7 +152,7 @@ def unpack_string(content: bytes) -> str:
     length = int.from_bytes(content[2:4], "big")
     if len(content) < 4 + length:
         raise ProtocolError("a STRING is cut off.")
-    return content[4 : 4 + length].split(b"\0")[0].decode(errors="replace")
+    return _text(content[4 : 4 + length])
 
 
 def unpack_points(content: bytes) -> list[tuple[str, str, Float[np.ndarray, " 3"]]]:
@@ -165,15 +164,13 @@ def unpack_points(content: bytes) -> list[tuple[str, str, Float[np.ndarray, " 3"
     for name, group, *_, x, y, z, _, _ in _POINT.iter_unpack(content):
         if not np.isfinite((x, y, z)).all():
             raise ProtocolError("a POINT is not finite.")
-        texts = (raw.split(b"\0")[0].decode(errors="replace") for raw in (name, group))
-        points.append((*texts, np.array([x, y, z])))
+        points.append((_text(name), _text(group), np.array([x, y, z])))
     return points
 
 
 def unpack_polydata_points(content: bytes) -> Float[np.ndarray, "n 3"]:
     """The points of a POLYDATA. Raises ProtocolError: it is cut off, or not finite."""
-    count = int.from_bytes(content[:4], "big")
-    end = _POLYDATA.size + 12 * count
+    end = _POLYDATA.size + 12 * int.from_bytes(content[:4], "big")
     if len(content) < end:
         raise ProtocolError("a POLYDATA is cut off.")
     with np.errstate(invalid="ignore"):
@@ -181,6 +178,10 @@ def unpack_polydata_points(content: bytes) -> Float[np.ndarray, "n 3"]:
     if not np.isfinite(points).all():
         raise ProtocolError("a POLYDATA is not finite.")
     return points
+
+
+def _text(raw: bytes) -> str:
+    return raw.split(b"\0")[0].decode(errors="replace")
 
 
 def crc64(data: bytes) -> int:
@@ -205,35 +206,6 @@ def pack_status(code: int, name: str, text: str) -> bytes:
     return _STATUS.pack(code, 0, name.encode("ascii", "replace")[:20]) + text.encode() + b"\0"
 
 
-@dataclass(frozen=True, eq=False)
-class Polydata:
-    """Points and cells of point numbers; ``scalars``: one per point, by name."""
-
-    points: Float[np.ndarray, "n 3"]
-    triangles: Int[np.ndarray, "f 3"]
-    segments: Int[np.ndarray, "s 2"] = field(default_factory=lambda: np.zeros((0, 2), np.int32))
-    scalars: dict[str, Num[np.ndarray, " n"]] = field(default_factory=dict)
-
-
-def pack_polydata(data: Polydata) -> bytes:
-    """Triangles are sent as polygons, segments as lines."""
-    lines, polygons = _cells(data.segments), _cells(data.triangles)
-    head = _POLYDATA.pack(
-        len(data.points),
-        *(0, 0),  # vertices: 3D Slicer's reader writes past its memory at the second one
-        *(len(data.segments), len(lines)),
-        *(len(data.triangles), len(polygons)),
-        *(0, 0),  # triangle strips
-        len(data.scalars),
-    )
-    points = np.asarray(data.points).astype(">f4").tobytes()
-    kinds = [_ATTRIBUTE.pack(_POINT_SCALARS, 1, len(values)) for values in data.scalars.values()]
-    names = b"".join(name.encode("ascii") + b"\0" for name in data.scalars)
-    values = [np.asarray(values).astype(">f4").tobytes() for values in data.scalars.values()]
-    padding = bytes(len(names) % 2)
-    return b"".join((head, points, lines, polygons, *kinds, names, padding, *values))
-
-
 def pack_points(
     points_mm: Float[np.ndarray, "n 3"], labels: Sequence[str], colours: Sequence[Colour]
 ) -> bytes:
@@ -242,6 +214,30 @@ def pack_points(
         _POINT.pack(label.encode("ascii", "replace")[:63], b"Fiducial", *rgb, 255, *point, 0.0, b"")
         for label, rgb, point in zip(labels, colours, points_mm, strict=True)
     )
+
+
+def pack_polydata(
+    points: Float[np.ndarray, "n 3"],
+    triangles: Int[np.ndarray, "f 3"],
+    segments: Int[np.ndarray, "s 2"] = _NO_SEGMENTS,
+    **scalars: Num[np.ndarray, " n"],
+) -> bytes:
+    """Points and cells of their numbers: triangles are sent as polygons, segments as lines.
+    ``scalars``: one per point, by name."""
+    lines, polygons = _cells(segments), _cells(triangles)
+    head = _POLYDATA.pack(
+        len(points),
+        *(0, 0),  # vertices: 3D Slicer's reader writes past its memory at the second one
+        *(len(segments), len(lines)),
+        *(len(triangles), len(polygons)),
+        *(0, 0),  # triangle strips
+        len(scalars),
+    )
+    kinds = [_ATTRIBUTE.pack(_POINT_SCALARS, 1, len(values)) for values in scalars.values()]
+    names = b"".join(name.encode("ascii") + b"\0" for name in scalars)
+    numbers = [np.asarray(one).astype(">f4").tobytes() for one in (points, *scalars.values())]
+    padding = bytes(len(names) % 2)
+    return b"".join((head, numbers[0], lines, polygons, *kinds, names, padding, *numbers[1:]))
 
 
 def _cells(cells: np.ndarray) -> bytes:

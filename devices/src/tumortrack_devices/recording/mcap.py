@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import io
-import os
-import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +19,6 @@ from tumortrack_devices.ros.messages import Messages, Outgoing
 from tumortrack_devices.ros.sensors import CAMERA_FRAME, messages_seen
 from tumortrack_devices.ros.tf import TRANSFORMS, transform_fields
 
-CHUNK_S = 0.25  # a crash loses messages that are not in a chunk yet
 STRING = "std_msgs/msg/String"
 EVIDENCE = "evidence"  # topic beside the depth image's: what became known with a frame
 
@@ -35,82 +31,64 @@ class FrameEvidence(Config, frozen=True, kw_only=True):
 
 
 class McapBag:
-    """A new rosbag2 folder with one MCAP.
+    """A new rosbag2 folder with one MCAP. Raises InputError: there is something already.
 
-    Messages are filed by time of arrival, which never goes back; headers have the stamps. When the
-    disk is full, whole chunks stay, in a file without an end, and each later write raises the same
-    StorageError, which ends with ``advice``.
+    Messages are filed by time of arrival, which never goes back; headers have the stamps. A crash
+    loses at most the last MiB, which is not on the disk yet. When the disk is full, whole chunks
+    stay, in a file without an end, and each later write raises the same StorageError, which ends
+    with ``advice``.
     """
 
     def __init__(
         self, folder: Path, messages: Messages, advice: str, compressed: bool = False
     ) -> None:
-        from rosbags.rosbag2 import (
-            CompressionFormat,
-            CompressionMode,
-            StoragePlugin,
-            Writer,
-            WriterError,
-        )
+        from rosbags import rosbag2
 
-        self._messages, self._advice = messages, advice
+        self._folder, self._messages, self._advice = folder, messages, advice
         self._connections: dict[str, Any] = {}
-        self._last_ns, self._chunk_s = 0, time.monotonic()
-        self._refused = ""
+        self._last_ns, self._refused, self._closed = 0, "", False
         try:
             # Version 8 is Humble's.
-            writer: Any = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)
+            self._writer = rosbag2.Writer(
+                folder, version=8, storage_plugin=rosbag2.StoragePlugin.MCAP
+            )
             if compressed:  # each chunk, as ROS 2 does it too
-                writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-            writer.open()
-        except WriterError as error:
+                mode = rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD
+                self._writer.set_compression(*mode)
+            self._writer.open()
+        except rosbag2.WriterError as error:
             raise InputError(f"{folder} exists already. Choose another path.") from error
-        self._writer, self._storage = writer, writer.storage
-        self._storage.bio.close()  # a buffer could not be truncated on a full disk
-        self._storage.bio = self._file = _WholeWrites(self._storage.path)
-        self._whole = self._file.tell()  # the end of the last whole chunk
 
     def write(self, arrived_ns: int, out: Iterable[Outgoing]) -> None:
-        """Messages with full topic names; they are on the disk 0.25 s later."""
+        """Messages with full topic names."""
         if self._refused:
             raise StorageError(self._refused)
         self._last_ns = max(self._last_ns, arrived_ns)
-        for topic, message_type, message in out:
-            if topic not in self._connections:
-                self._connections[topic] = self._writer.add_connection(
-                    topic, message_type, typestore=self._messages.store
-                )
-            data = self._messages.to_bytes(message)
-            with self._on_disk():
+        with self._on_disk():
+            for topic, message_type, message in out:
+                if topic not in self._connections:
+                    self._connections[topic] = self._writer.add_connection(
+                        topic, message_type, typestore=self._messages.store
+                    )
+                data = self._messages.to_bytes(message)
                 self._writer.write(self._connections[topic], self._last_ns, data)
-        if time.monotonic() - self._chunk_s >= CHUNK_S:
-            self.flush()
 
     def close(self) -> None:
         """Write the index and metadata.yaml."""
-        if not self._file.closed:
-            if self._storage.chunk.msgs:
-                self.flush()
+        if not (self._closed or self._refused):
+            self._closed = True
             with self._on_disk():
                 self._writer.close()
 
-    def flush(self) -> None:
-        with self._on_disk():
-            self._storage.close_chunk()
-
     @contextmanager
     def _on_disk(self) -> Iterator[None]:
-        """For calls that may write a chunk: if one fails, only whole chunks are left."""
         try:
             yield
         except OSError as error:
-            if not self._file.closed:
-                os.ftruncate(self._file.fileno(), self._whole)
-                self._file.close()
-            self._refused = f"cannot write {self._file.name}: {error.strerror}. {self._advice}"
+            with suppress(OSError):  # it may have more to write
+                self._writer.abort()
+            self._refused = f"cannot write {self._folder}: {error.strerror}. {self._advice}"
             raise StorageError(self._refused) from error
-        if not self._file.closed and (end := self._file.tell()) > self._whole:
-            self._whole, self._chunk_s = end, time.monotonic()
 
 
 def camera_messages(
@@ -142,18 +120,3 @@ def evidence_message(result: TrackingResult, messages: Messages, number: int) ->
     text = messages.make(STRING, data=msgspec.json.encode(known).decode())
     suffix = f"_{number}" if number > 1 else ""
     return Outgoing(f"/camera{suffix}/{EVIDENCE}", STRING, text)
-
-
-class _WholeWrites(io.FileIO):
-    """Appends without a buffer; each write is complete or raises."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, "r+")
-        self.seek(0, io.SEEK_END)
-
-    def write(self, data: Any) -> int:
-        left = memoryview(data).cast("B")
-        size = len(left)
-        while left:
-            left = left[super().write(left) or 0 :]
-        return size

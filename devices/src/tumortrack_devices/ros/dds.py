@@ -2,33 +2,30 @@
 
 A topic /a/b is ``rt/a/b`` on the wire, its type ``pkg::msg::dds_::Name_``, its encoding XCDR1,
 and the endpoint's user data holds the type's hash (https://design.ros2.org/articles/
-topic_and_service_names.html, REP 2011, REP 2016). cyclonedds' Python layer would turn samples into
-Python objects, 40,000 points at 17 Hz; here bytes go straight to its C library.
+topic_and_service_names.html, REP 2011, REP 2016).
 """
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import re
 import threading
+import time
+import weakref
 from functools import cache
 from typing import Any
 
-import numpy as np
 from cyclonedds import core, pub, sub
-from cyclonedds._clayer import ddspy_take
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import make_idl_struct, types
-from cyclonedds.internal import DDS, dds_c_t
 from cyclonedds.qos import Policy, Qos
-from cyclonedds.topic import Sample, Topic
+from cyclonedds.topic import Topic
 from rosbags.interfaces import Nodetype
 
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack_devices.ros.bus import Publisher, Subscriber
+from tumortrack_devices.ros.bus import Publish, Subscriber
 from tumortrack_devices.ros.messages import Messages
 
 # A writer waits while more than WhcHigh is unacknowledged. One cloud exceeds the default of 500 kB:
@@ -58,11 +55,11 @@ _OTHER_TYPES: dict[str, Any] = {  # that have other names in cyclonedds than in 
     **dict.fromkeys(("char", "byte", "octet"), types.uint8),
 }
 
-# A domain is set up once per process, with one participant and one topic of each name and type.
-# None of it is ever released: making a domain again would cut off its other users, and Cyclone
-# (11.0.1) searches all types without a lock while it makes a topic, so that a program that left the
-# graph and joined it again could crash.
-_domains: dict[int, tuple[Any, DomainParticipant]] = {}
+# A domain is set up once per process, with one participant, one reader of what is published, and
+# one topic of each name and type. None of it is ever released: making a domain again would cut off
+# its other users, and Cyclone (11.0.1) searches all types without a lock while it makes a topic, so
+# that a program that left the graph and joined it again could crash.
+_domains: dict[int, tuple[Any, DomainParticipant, BuiltinDataReader]] = {}
 _topics: dict[tuple[int, str, str], Any] = {}
 _setting_up = threading.Lock()
 
@@ -73,22 +70,23 @@ class DdsBus:
     the network cannot be used."""
 
     def __init__(self, messages: Messages) -> None:
-        self.messages = messages
-        self._closing = threading.Lock()
-        self._domain = domain = domain_id()
+        self.messages, self._domain = messages, domain_id()
         try:
-            member = _member_of(domain)
-            self._waitset, self._over = core.WaitSet(member), core.GuardCondition(member)
+            self._member, self._published = _join(self._domain)
+            self._waitset, self._over = (
+                core.WaitSet(self._member),
+                core.GuardCondition(self._member),
+            )
             self._waitset.attach(self._over)  # with nothing attached it would not wait
-            self._published = BuiltinDataReader(member, BuiltinTopicDcpsPublication)
-            self._writers, self._readers = pub.Publisher(member), sub.Subscriber(member)
         except core.DDSException as error:
             raise InputError(
-                f"DDS domain {domain} cannot be joined ({_error_text(error.code)}; Cyclone "
+                f"DDS domain {self._domain} cannot be joined ({_error_text(error)}; Cyclone "
                 "DDS says more above). Check the network, CYCLONEDDS_URI, and that not too many "
                 "programs are in that domain."
             ) from error
-        self._closed = False
+        # Whatever nobody refers to is deleted, as cyclonedds has it: these are the only references.
+        self._writers: list[Any] = []
+        self._conditions: list[core.ReadCondition] = []
         self.note = (
             "on this machine alone"
             if _stays_here()
@@ -96,30 +94,25 @@ class DdsBus:
             "names; ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST keeps it on this machine"
         )
 
-    def publisher(self, topic: str, kind: str, latched: bool = False) -> Publisher:
-        durability = Policy.Durability
+    def publisher(self, topic: str, kind: str, latched: bool = False) -> Publish:
+        durability, wire = Policy.Durability, _wire_type(kind)
         kept = durability.TransientLocal if latched else durability.Volatile
         reliable = Policy.Reliability.Reliable(_BLOCKED_NS)
-        writer: Any = pub.DataWriter(self._writers, *self._endpoint(topic, kind, reliable, kept, 1))
-        # By ctypes: the extension module holds the GIL while it waits for a slow subscriber.
-        write = DDS._dll_handle.dds_write
-        write.argtypes = [ctypes.c_int32, ctypes.POINTER(Sample)]
-        write.restype = ctypes.c_int32
+        made: Any = pub.DataWriter(self._member, *self._endpoint(topic, kind, reliable, kept, 1))
+        self._writers.append(made)
+        known = weakref.ref(made)
 
         def publish(raw: bytes | memoryview) -> None:
             """Fails if subscribers don't keep up, or the bytes are not of the topic's type."""
-            padded = np.frombuffer(bytes(raw) + bytes(-len(raw) % 4), np.uint8)
-            sample = Sample(padded.ctypes.data, padded.nbytes)
-            if (code := write(writer._ref, ctypes.byref(sample))) < 0:
+            try:
+                if (writer := known()) is not None:
+                    writer.write(wire.deserialize(bytes(raw)))
+            except core.DDSException as error:
                 raise TumortrackError(
-                    f"{topic}: a message of {len(raw)} bytes was not sent ({_error_text(code)})."
-                )
+                    f"{topic}: a message of {len(raw)} bytes was not sent ({_error_text(error)})."
+                ) from error
 
-        def flush(timeout_s: float) -> None:
-            # Its public method fails on a timeout (11.0.1).
-            writer._wait_for_acks(writer._ref, int(timeout_s * 1e9))
-
-        return Publisher(publish, flush)
+        return publish
 
     def subscriber(self, topic: str, kind: str, most: int = 5, latched: bool = False) -> Subscriber:
         # Best effort and volatile match every publisher; what was published before comes only to
@@ -127,14 +120,11 @@ class DdsBus:
         qos: tuple[Any, Any] = (Policy.Reliability.BestEffort, Policy.Durability.Volatile)
         if latched:
             qos = Policy.Reliability.Reliable(0), Policy.Durability.TransientLocal
-        subscriber = DdsSubscriber(
-            sub.DataReader(self._readers, *self._endpoint(topic, kind, *qos, most)), most
-        )
-        self._waitset.attach(subscriber.condition)
-        return subscriber
-
-    def types_of(self, topic: str) -> set[str]:
-        return self.topics().get(topic, set())
+        reader: Any = sub.DataReader(self._member, *self._endpoint(topic, kind, *qos, most))
+        mask = core.ViewState.Any | core.InstanceState.Any | core.SampleState.NotRead
+        self._conditions.append(core.ReadCondition(reader, mask))
+        self._waitset.attach(self._conditions[-1])
+        return DdsSubscriber(self._conditions[-1], most)
 
     def topics(self) -> dict[str, set[str]]:
         mask = core.ViewState.Any | core.SampleState.Any | core.InstanceState.Alive
@@ -147,17 +137,20 @@ class DdsBus:
         return topics
 
     def wait(self, timeout_s: float) -> None:
-        with contextlib.suppress(core.DDSException):  # closed meanwhile by another thread
-            self._waitset.wait(max(0, int(timeout_s * 1e9)))
+        self._waitset.wait(max(0, int(timeout_s * 1e9)))
+
+    def flush(self, timeout_s: float) -> None:
+        until_s = time.monotonic() + timeout_s
+        for writer in self._writers:
+            with contextlib.suppress(AttributeError):  # which it raises on a timeout (11.0.1)
+                writer.wait_for_acks(max(0, int((until_s - time.monotonic()) * 1e9)))
 
     def close(self) -> None:
-        with self._closing:
-            closed, self._closed = self._closed, True
-        if not closed:
-            self._over.set(True)
-            made = (self._writers, self._readers, self._published, self._waitset, self._over)
-            for entity in made:
-                entity._delete(entity._ref)  # and with it all that it made
+        self._over.set(True)
+        for condition in list(self._conditions):
+            self._waitset.detach(condition)
+        self._writers.clear()
+        self._conditions.clear()
 
     def _endpoint(
         self, topic: str, kind: str, reliability: Any, durability: Any, most: int
@@ -170,25 +163,21 @@ class DdsBus:
         return _topic(self._domain, topic, kind), qos
 
 
-class DdsSubscriber(Subscriber):
-    """Takes messages from Cyclone's own queue."""
+class DdsSubscriber:
+    """Takes messages from Cyclone's own queue, of ``most``; once closed there are none."""
 
-    def __init__(self, reader: Any, most: int) -> None:
-        super().__init__(most)
-        self._reader = reader
-        mask = core.ViewState.Any | core.InstanceState.Any | core.SampleState.NotRead
-        self.condition = core.ReadCondition(self._reader, mask)
+    def __init__(self, condition: core.ReadCondition, most: int) -> None:
+        self.lost, self._most = 0, most
+        self._condition = weakref.ref(condition)
 
     def take(self) -> list[bytes | memoryview]:
-        # Polled: a listener would make the thread that empties the socket wait for the GIL. Once
-        # closed it is 0.
-        status = dds_c_t.sample_lost_status()
-        DDS._dll_handle.dds_get_sample_lost_status(self._reader._ref, ctypes.byref(status))
-        self.lost = max(self.lost, int(status.total_count))
-        taken = ddspy_take(self._reader._ref, self.condition.mask, self.pending.maxlen)
-        if isinstance(taken, int):  # an error: closed meanwhile by another thread
+        if (condition := self._condition()) is None:
             return []
-        return [data for data, info in taken if info.valid_data]
+        # Polled: a listener would make the thread that empties the socket wait for the GIL.
+        self.lost = int(condition.reader.get_sample_lost_status().total_count)
+        # Of a writer that is gone there is a sample without a message.
+        taken = condition.reader.take(self._most, condition)
+        return [one.raw for one in taken if hasattr(one, "raw")]
 
 
 def domain_id() -> int:
@@ -201,10 +190,10 @@ def domain_id() -> int:
     return int(text)
 
 
-def _member_of(domain: int) -> DomainParticipant:
-    """This process's participant. Raises InputError where the environment forbids any."""
-    reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper()
-    if reach == "OFF":
+def _join(domain: int) -> tuple[DomainParticipant, BuiltinDataReader]:
+    """This process's participant, and what it reads of others. Raises InputError where the
+    environment forbids any."""
+    if os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "OFF":
         raise InputError(
             "ROS_AUTOMATIC_DISCOVERY_RANGE is OFF: no topic would ever be found. Allowed here: "
             "LOCALHOST, SUBNET, SYSTEM_DEFAULT, or not set."
@@ -214,15 +203,17 @@ def _member_of(domain: int) -> DomainParticipant:
             local = _LOCAL if _stays_here() else ""
             parts = (_TUNING, local, os.environ.get("CYCLONEDDS_URI", ""))
             made = Domain(domain, ",".join(filter(None, parts)))
-            _domains[domain] = made, DomainParticipant(domain, Qos(Policy.Userdata(b"enclave=/;")))
-        return _domains[domain][1]
+            member = DomainParticipant(domain, Qos(Policy.Userdata(b"enclave=/;")))
+            published = BuiltinDataReader(member, BuiltinTopicDcpsPublication)
+            _domains[domain] = made, member, published
+        return _domains[domain][1:]
 
 
 def _topic(domain: int, topic: str, kind: str) -> Any:
     with _setting_up:
         key = domain, topic, kind
         if key not in _topics:
-            _topics[key] = Topic(_domains[domain][1], "rt" + topic, idl_type(kind))
+            _topics[key] = Topic(_domains[domain][1], "rt" + topic, _wire_type(kind))
         return _topics[key]
 
 
@@ -231,8 +222,8 @@ def _stays_here() -> bool:
     return os.environ.get("ROS_LOCALHOST_ONLY") == "1" or reach == "LOCALHOST"
 
 
-def _error_text(code: int) -> str:
-    _, text = core.DDSException.error_message_mapping.get(code, ("", f"error {code}"))
+def _error_text(error: core.DDSException) -> str:
+    _, text = error.error_message_mapping.get(error.code, ("", f"error {error.code}"))
     return text.strip(" .").lower()
 
 
@@ -249,9 +240,29 @@ def ros_name(type_name: str) -> str:
 
 
 @cache
+def _wire_type(message_type: str) -> Any:
+    """The type, of which an object is just the bytes of a message (``raw``): cyclonedds would make
+    Python objects of them, 40,000 points at 17 Hz."""
+    kind = _made(message_type)
+
+    def holding(cls: Any, data: bytes) -> Any:
+        one = object.__new__(cls)
+        one.raw = data
+        return one
+
+    kind.serialize = lambda self, **_: self.raw
+    kind.deserialize = kind.deserialize_key = classmethod(holding)
+    return kind
+
+
+@cache
 def idl_type(message_type: str) -> Any:
     """The type as a cyclonedds ``IdlStruct``: final, without a key, as ROS 2 makes it. Cyclone
     validates bytes from the network by it, lengths included."""
+    return _made(message_type)
+
+
+def _made(message_type: str) -> Any:
     _, fields = Messages().store.fielddefs[message_type]
     members = {name: _member(kind) for name, kind in fields}
     name = message_type.rsplit("/", 1)[-1]

@@ -19,7 +19,6 @@ from tumortrack.core import colours
 from tumortrack.core.colours import Colour
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.organ import is_tumor, organ_name
-from tumortrack.core.patient import Patient
 from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.live.values import (
     RigidShape,
@@ -28,9 +27,9 @@ from tumortrack.live.values import (
     TransformedEstimate,
     Workcell,
 )
-from tumortrack_devices.beside import Beside, NextTouch
+from tumortrack_devices.beside import Beside
 from tumortrack_devices.display import MOST_SEEN, seen_points, thinned, wxyz_of
-from tumortrack_devices.rate import Rate
+from tumortrack_devices.network import Rate
 from tumortrack_devices.ros.messages import MM_PER_M, Messages, Outgoing, PointBlock, xyz
 from tumortrack_devices.ros.sensors import CLOUD, cloud_message, plain_cloud
 from tumortrack_devices.ros.tf import TRANSFORMS, transform_fields
@@ -70,8 +69,8 @@ _POINT = np.dtype(
 
 
 class ResultMessages:
-    """The messages of one publisher. It remembers the markers of the arms, to delete those that are
-    gone.
+    """The messages of one publisher. It remembers the markers that it sent, to delete those that
+    are gone.
 
     ``namespace``: of the topics and of tf frames. ``hz``: limit for triangles, the arms' markers
     and observed points (0: with every result); without ``observed`` those points are left out.
@@ -90,8 +89,8 @@ class ResultMessages:
         self._status_rate, self._levels = Rate(_STATUS_HZ), list[int]()
         self._times_s = deque[float](maxlen=_RATE_OVER)  # of the latest results
         self._meshes_rate, self._markers_rate, self._points_rate = Rate(hz), Rate(hz), Rate(hz)
-        self._beside, self._spots_shown, self._texts_shown = Beside(), set[str](), 0
-        self._shown: set[str] = set()
+        self._beside = Beside()
+        self._spots_shown, self._shown = set[tuple[str, int]](), set[str]()
         self._shown_state: tuple[str, bool, bool] | None = None
         self._planned: tuple[Mesh, ...] | None = None  # sent last
 
@@ -102,28 +101,23 @@ class ResultMessages:
         self._beside.update(result)
         out: list[Outgoing] = []
 
-        def send(suffix: str, message_type: str, **values: Any) -> None:
-            message = self._messages.make(message_type, **values)
-            out.append(Outgoing(suffix, message_type, message))
+        def send(suffix: str, kind: str, **values: Any) -> None:
+            out.append(Outgoing(suffix, kind, self._messages.make(kind, **values)))
 
-        def send_markers(suffix: str, markers: list[dict[str, Any]]) -> None:
-            common = {"header": header, "lifetime": {"sec": _LIFETIME_S}}
+        def send_markers(suffix: str, markers: list[dict[str, Any]], seconds: int) -> None:
+            common = {"header": header, "lifetime": {"sec": seconds}}
             send(suffix, MARKERS, markers=[common | marker for marker in markers])
 
         cloud = _labelled_cloud(result.transformed, header, self._messages)
         out.append(Outgoing("cloud", CLOUD, cloud))
-        send_markers("meshes", self._organ(result))
+        send_markers("meshes", self._organ(result), _LIFETIME_S)
         for name in self._context.parts:
             center_mm = result.center_mm(name)
             metres = np.full(3, np.nan) if center_mm is None else center_mm / MM_PER_M
             send(f"{name}/center", PLACE, header=header, point=xyz(metres))
-        out.append(Outgoing("/tf", TRANSFORMS, self._frames(result)))
-        self._times_s.append(time.monotonic())
-        past_s = self._times_s[-1] - self._times_s[0]
-        hz = (len(self._times_s) - 1) / past_s if past_s > 0 else 0.0
+        send("/tf", TRANSFORMS, transforms=self._frames(result))
         arms = [_arms_status(result)] if self._context.arms else []
-        touches = self._beside.touches
-        status = [_estimate_status(result, self._context.patient, hz, touches), *arms]
+        status = [self._estimate_status(result), *arms]
         send("diagnostics", DIAGNOSTICS, header=header, status=status)
         levels = [entry["level"] for entry in status]
         if self._status_rate.due() or levels != self._levels:
@@ -135,23 +129,25 @@ class ResultMessages:
         angles = np.array(list(joints.values()), np.float64)
         send("joint_states", JOINTS, header=header, name=list(joints), position=angles)
         if (markers := self._workcell(result)) is not None:
-            send_markers("workcell", markers)
+            send_markers("workcell", markers, _LIFETIME_S)
         if (markers := self._as_planned(result)) is not None:
-            send(LATCHED, MARKERS, markers=[{"header": header} | marker for marker in markers])
+            send_markers(LATCHED, markers, 0)
         if self._observed and (points := self._points(result)) is not None:
             seen = plain_cloud(SensorCloud(points, result.stamp_ns), header, self._messages)
             out.append(Outgoing("observed", CLOUD, seen))
         return out
 
-    def _frames(self, result: TrackingResult) -> Any:
+    def _frames(self, result: TrackingResult) -> list[dict[str, Any]]:
         """A transform to each part, of good estimates only: tf can't mark one as poor."""
-        parent, transforms = result.published_frame.frame_id, []
-        if result.estimate is not None and result.quality == "good":
-            for name in result.estimate.meshes:
-                pose, names = result.part_pose(name), (parent, f"{self._namespace}/{name}")
-                assert pose is not None
-                transforms.append(transform_fields(self._messages, result.stamp_ns, *names, pose))
-        return self._messages.make(TRANSFORMS, transforms=transforms)
+        if result.estimate is None or result.quality != "good":
+            return []
+        stamp_ns, parent = result.stamp_ns, result.published_frame.frame_id
+        poses = {name: result.part_pose(name) for name in result.estimate.meshes}
+        return [
+            transform_fields(self._messages, stamp_ns, parent, f"{self._namespace}/{name}", pose)
+            for name, pose in poses.items()
+            if pose is not None
+        ]
 
     def _organ(self, result: TrackingResult) -> list[dict[str, Any]]:
         """Triangles per part, spots and a text of the quality; without an estimate all are
@@ -184,17 +180,13 @@ class ResultMessages:
             if len(places_mm):
                 scale, points = xyz((2 * radius_m,) * 3), PointBlock(places_mm / MM_PER_M)
                 markers.append(_marker(ns, _SPHERES, colour, scale=scale, points=points))
-                self._spots_shown.add(ns)
-            elif ns in self._spots_shown:
-                markers.append({"ns": ns, "action": _DELETE})
-        scale = {"z": _TEXT_HEIGHT_M}
         for number, touch in enumerate(beside.touches):
-            about = {"id": number, "text": touch.label, "scale": scale}
+            about = {"id": number, "text": touch.label, "scale": {"z": _TEXT_HEIGHT_M}}
             markers.append(_marker(_NEXT_TEXT, _TEXT, colours.WHITE, touch.place_mm, **about))
-        for number in range(len(beside.touches), self._texts_shown):
-            markers.append({"ns": _NEXT_TEXT, "id": number, "action": _DELETE})
-        self._texts_shown = max(self._texts_shown, len(beside.touches))
-        return markers
+        now = {(marker["ns"], marker.get("id", 0)) for marker in markers}
+        self._spots_shown |= now
+        gone = sorted(self._spots_shown - now)
+        return markers + [{"ns": ns, "id": number, "action": _DELETE} for ns, number in gone]
 
     def _workcell(self, result: TrackingResult) -> list[dict[str, Any]] | None:
         """All of its markers or, if they are not due, None: a slow receiver keeps only the newest
@@ -211,23 +203,11 @@ class ResultMessages:
         if not self._markers_rate.due() and not changed:
             return None
         markers: list[dict[str, Any]] = [{"ns": name, "action": _DELETE} for name in sorted(gone)]
-        markers += self._shape_markers(shapes)
+        markers += _shape_markers(shapes)
         for line in cell.drawn_lines:
             scale, points = {"x": line.width_mm / MM_PER_M}, PointBlock(line.points_mm / MM_PER_M)
             markers.append(_marker(line.name, _LINE, line.colour, scale=scale, points=points))
         return [*markers, _state_text(result, cell)]
-
-    def _shape_markers(self, shapes: Sequence[RigidShape]) -> list[dict[str, Any]]:
-        markers, turns = [], [shape.published_from_shape[:3, :3] for shape in shapes]
-        quaternions = wxyz_of(np.array(turns)) if turns else ()  # all at once: 5 times faster
-        for shape, wxyz in zip(shapes, quaternions, strict=True):
-            marker = _triangles(shape.name, shape.mesh, shape.colour, shape.opacity)
-            marker["pose"] = {
-                "position": xyz(shape.published_from_shape[:3, 3] / MM_PER_M),
-                "orientation": dict(zip("wxyz", wxyz.tolist(), strict=True)),
-            }
-            markers.append(marker)
-        return markers
 
     def _as_planned(self, result: TrackingResult) -> list[dict[str, Any]] | None:
         """What neither moves nor deforms, two thirds of all triangles: only when it changes."""
@@ -236,7 +216,7 @@ class ResultMessages:
         if self._planned is not None and list(map(id, meshes)) == list(map(id, self._planned)):
             return None
         self._planned = meshes
-        return [{"action": _DELETE_ALL}, *self._shape_markers(shapes)]
+        return [{"action": _DELETE_ALL}, *_shape_markers(shapes)]
 
     def _points(self, result: TrackingResult) -> Float32[np.ndarray, "n 3"] | None:
         """The observed points, published frame; None: they are not due."""
@@ -247,25 +227,25 @@ class ResultMessages:
         points_mm = thinned(seen_points(result.observation), MOST_SEEN)
         return transform_points(result.published_frame.published_from_camera, points_mm)
 
-
-def _estimate_status(
-    result: TrackingResult, patient: Patient, hz: float, touches: tuple[NextTouch, ...]
-) -> dict[str, Any]:
-    values: dict[str, Any] = {
-        "patient": patient.id,
-        "side": patient.side,
-        "quality": result.quality,
-        "sequence": result.sequence,
-        "stamp_ns": result.stamp_ns,
-        "points": 0 if result.organ is None else len(result.organ.points_mm),
-        "rate_hz": f"{hz:.1f}",
-        "dropped": result.dropped,
-    }
-    if result.latency_ms is not None:
-        values["latency_ms"] = f"{result.latency_ms:.3f}"
-    values |= {f"{stage}_ms": f"{1000 * s:.3f}" for stage, s in result.seconds.items()}
-    values |= {f"{_NEXT}_{rank}": touch.words for rank, touch in enumerate(touches, start=1)}
-    return _status(_LEVELS[result.quality], "estimate", result.describe(), result, values)
+    def _estimate_status(self, result: TrackingResult) -> dict[str, Any]:
+        self._times_s.append(time.monotonic())
+        past_s = self._times_s[-1] - self._times_s[0]
+        values: dict[str, Any] = {
+            "patient": self._context.patient.id,
+            "side": self._context.patient.side,
+            "quality": result.quality,
+            "sequence": result.sequence,
+            "stamp_ns": result.stamp_ns,
+            "points": 0 if result.organ is None else len(result.organ.points_mm),
+            "rate_hz": f"{(len(self._times_s) - 1) / past_s if past_s > 0 else 0.0:.1f}",
+            "dropped": result.dropped,
+        }
+        if result.latency_ms is not None:
+            values["latency_ms"] = f"{result.latency_ms:.3f}"
+        values |= {f"{stage}_ms": f"{1000 * s:.3f}" for stage, s in result.seconds.items()}
+        for rank, touch in enumerate(self._beside.touches, start=1):
+            values[f"{_NEXT}_{rank}"] = touch.words
+        return _status(_LEVELS[result.quality], "estimate", result.describe(), result, values)
 
 
 def _arms_status(result: TrackingResult) -> dict[str, Any]:
@@ -318,8 +298,8 @@ def _state_text(result: TrackingResult, cell: Workcell) -> dict[str, Any]:
     text = fill(_describe(cell), _STATE_COLUMNS)
     if result.estimate is None:
         text += f"\n{fill(result.describe(), _STATE_COLUMNS)}"
-    box_mm, lines_mm = cell.box_mm, [line.points_mm for line in cell.drawn_lines]
-    extents = lines_mm if box_mm is None else [box_mm, *lines_mm]
+    extents = [line.points_mm for line in cell.drawn_lines]
+    extents += [] if cell.box_mm is None else [cell.box_mm]
     corners = np.concatenate(extents) if extents else np.zeros((1, 3))
     position_mm = (corners.min(0) + corners.max(0)) / 2
     position_mm[2] = corners[:, 2].max() - _half_height_mm(text, _STATE_HEIGHT_M)
@@ -334,6 +314,19 @@ def _half_height_mm(text: str, height_m: float) -> float:
 
 def _describe(cell: Workcell) -> str:
     return f"{cell.state}, halted: {cell.halted}" if cell.halted else cell.state
+
+
+def _shape_markers(shapes: Sequence[RigidShape]) -> list[dict[str, Any]]:
+    markers, turns = [], [shape.published_from_shape[:3, :3] for shape in shapes]
+    quaternions = wxyz_of(np.array(turns)) if turns else ()  # all at once: 5 times faster
+    for shape, wxyz in zip(shapes, quaternions, strict=True):
+        marker = _triangles(shape.name, shape.mesh, shape.colour, shape.opacity)
+        marker["pose"] = {
+            "position": xyz(shape.published_from_shape[:3, 3] / MM_PER_M),
+            "orientation": dict(zip("wxyz", wxyz.tolist(), strict=True)),
+        }
+        markers.append(marker)
+    return markers
 
 
 def _triangles(ns: str, mesh: Mesh, colour: Colour, opacity: float) -> dict[str, Any]:

@@ -15,9 +15,8 @@ from tumortrack.core.report import Finding
 from tumortrack.live.poses import CameraPoses, PoseBuffer, PosesConfig
 from tumortrack.live.values import Observation
 from tumortrack_devices.display import wxyz_of
-from tumortrack_devices.ros.bus import Bus
+from tumortrack_devices.ros.bus import Bus, Via, open_bus
 from tumortrack_devices.ros.messages import MM_PER_M, Messages, stamp_of, xyz
-from tumortrack_devices.ros.ros2 import Via, open_bus
 
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 _WAIT_S = 0.1  # for a transform after the frame's stamp: publishers of 10 Hz and faster

@@ -11,11 +11,10 @@ from tumortrack.core.colours import PICKED, Colour, name_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
-from tumortrack_devices.rate import Rate
-from tumortrack_devices.ros.bus import check_topic
+from tumortrack_devices.network import Rate
+from tumortrack_devices.ros.bus import Via, check_topic, open_bus
 from tumortrack_devices.ros.messages import MM_PER_M, Messages, PointBlock
 from tumortrack_devices.ros.results import ORGAN_OPACITY
-from tumortrack_devices.ros.ros2 import Via, open_bus
 
 SCENE = "moveit_msgs/msg/PlanningScene"
 _MARGIN_OPACITY = 0.25
@@ -57,7 +56,7 @@ class MoveItSink:
         self._config, self._context, self._rate = config, context, Rate(config.hz)
         self._bus = open_bus(config.via)
         self.notes = (self._bus.note,)
-        self._publisher = self._bus.publisher(config.topic, SCENE)
+        self._send = self._bus.publisher(config.topic, SCENE)
 
     def publish(self, result: TrackingResult) -> None:
         if result.transformed is None or result.quality != "good" or not self._rate.due():
@@ -78,7 +77,7 @@ class MoveItSink:
             world={"collision_objects": objects},
             object_colors=colours,
         )
-        self._publisher.publish(messages.to_bytes(scene))
+        self._send(messages.to_bytes(scene))
 
     def close(self) -> None:
         self._bus.close()

@@ -23,14 +23,13 @@ from tumortrack.tracking.files import CENTRES, CT, MARGIN
 from tumortrack_devices.beside import Beside
 from tumortrack_devices.igtl import message as igtl
 from tumortrack_devices.igtl.link import Link
-from tumortrack_devices.igtl.message import Message, Polydata
-from tumortrack_devices.network import is_loopback
-from tumortrack_devices.rate import Rate
+from tumortrack_devices.igtl.message import Message
+from tumortrack_devices.network import Rate, is_loopback
 
 STATUS_DEVICE, CLOUD_DEVICE, ARMS_DEVICE = "tumortrack", "occupancy", "arms"
 TOUCH_DEVICE = "next_touch"
 _TIP = "/tip"  # the end of the names of shapes at tool tips
-_NOTHING = Polydata(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
+_NOTHING = igtl.pack_polydata(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
 _Content = tuple[str, str, bytes, dict[str, str]]  # type, device, content, own metadata
 
 
@@ -123,6 +122,7 @@ class OpenIgtLinkSink:
             *self._centres(result),
             *self._touches(result),
             *self._surfaces(result),
+            *self._cloud(result),
         ]
         self.link.send(
             [
@@ -181,10 +181,10 @@ class OpenIgtLinkSink:
             yield "POINT", TOUCH_DEVICE, igtl.pack_points(*content), {}
 
     def _surfaces(self, result: TrackingResult) -> Iterator[_Content]:
+        """Surfaces that are gone are emptied at once; others wait until they are due."""
         estimate = result.transformed
-        contents: dict[str, Polydata] = {}
+        contents: dict[str, bytes] = {}
         if self._config.mesh_hz:
-            # Surfaces that are gone are deleted at once; others wait until they are due.
             due = estimate is None or self._mesh_rate.due()
             meshes = {**estimate.meshes, **estimate.structures} if estimate else {}
             for name in (*self._context.parts, *self._context.structures):
@@ -192,34 +192,32 @@ class OpenIgtLinkSink:
                     contents[name] = _NOTHING
                 elif due:
                     contents[name] = self._surface(mesh)
-            contents |= self._shells(result, meshes, due)
-        if self._config.cloud_hz:
-            if estimate is None:
-                contents[CLOUD_DEVICE] = _NOTHING
-            elif self._cloud_rate.due():
-                # Each point is a line of length 0: Slicer shows only points of cells, and its
-                # reader does not support cells of one point.
-                segments = np.repeat(np.arange(len(estimate.points_mm))[:, None], 2, axis=1)
-                scalars = {"label": estimate.labels, "probability": estimate.probability}
-                points = transform_points(self._axes, estimate.points_mm)
-                contents[CLOUD_DEVICE] = Polydata(points, _NOTHING.triangles, segments, scalars)
+            for name in self._context.parts[1:]:  # as far off as the tumor may be
+                mesh, bound, shell = meshes.get(name), result.bounds.get(name), name + MARGIN
+                if mesh is None or bound is None:
+                    contents |= {shell: _NOTHING} if shell in self._margins else {}
+                elif due:
+                    self._margins.add(shell)
+                    contents[shell] = self._surface(rough_margin(mesh, bound.error_bound95_mm))
         for name, content in contents.items():
-            yield "POLYDATA", name, igtl.pack_polydata(content), {}
+            yield "POLYDATA", name, content, {}
 
-    def _shells(
-        self, result: TrackingResult, meshes: dict[str, Mesh], due: bool
-    ) -> dict[str, Polydata]:
-        """The tumors' surfaces, wider by how far off they are at most; empty where that is not
-        known any more."""
-        contents: dict[str, Polydata] = {}
-        for name in self._context.parts[1:]:
-            mesh, bound, shell = meshes.get(name), result.bounds.get(name), name + MARGIN
-            if mesh is None or bound is None:
-                contents |= {shell: _NOTHING} if shell in self._margins else {}
-            elif due:
-                self._margins.add(shell)
-                contents[shell] = self._surface(rough_margin(mesh, bound.error_bound95_mm))
-        return contents
+    def _cloud(self, result: TrackingResult) -> Iterator[_Content]:
+        estimate, content = result.transformed, _NOTHING
+        if not self._config.cloud_hz or (estimate is not None and not self._cloud_rate.due()):
+            return
+        if estimate is not None:
+            # Each point is a line of length 0: Slicer shows only points of cells, and its reader
+            # does not support cells of one point.
+            segments = np.repeat(np.arange(len(estimate.points_mm))[:, None], 2, axis=1)
+            content = igtl.pack_polydata(
+                transform_points(self._axes, estimate.points_mm),
+                np.zeros((0, 3), np.int32),
+                segments,
+                label=estimate.labels,
+                probability=estimate.probability,
+            )
+        yield "POLYDATA", CLOUD_DEVICE, content, {}
 
-    def _surface(self, mesh: Mesh) -> Polydata:
-        return Polydata(transform_points(self._axes, mesh.vertices_mm), mesh.faces)
+    def _surface(self, mesh: Mesh) -> bytes:
+        return igtl.pack_polydata(transform_points(self._axes, mesh.vertices_mm), mesh.faces)

@@ -17,19 +17,13 @@ from tumortrack.live.poses import COLUMNS, pose_row
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 from tumortrack.tracking.files import report_entry
 from tumortrack_devices.recording.folders import ABOUT
-from tumortrack_devices.recording.mcap import (
-    CHUNK_S,
-    STRING,
-    McapBag,
-    camera_messages,
-    evidence_message,
-)
+from tumortrack_devices.recording.mcap import STRING, McapBag, camera_messages, evidence_message
 from tumortrack_devices.ros.messages import Messages, Outgoing
 from tumortrack_devices.ros.results import ResultMessages
 
 POSES, STILL = "poses.csv", "poses.json"  # of a moving camera; of several fixed ones
 _ON_FULL_DISK = (
-    f"The recording ends {CHUNK_S:g} s before or less; it can be played with recording:FOLDER, and "
+    "The recording ends up to 1 MiB before; it can be played with recording:FOLDER, and "
     "`mcap recover` makes it whole for others."
 )
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from typing import ClassVar
 
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.geometry import Affine
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
-from tumortrack_devices.ros.bus import Bus, Publisher, check_topic
+from tumortrack_devices.ros.bus import Bus, Publish, Via, check_topic, open_bus
 from tumortrack_devices.ros.results import LATCHED, ResultMessages
-from tumortrack_devices.ros.ros2 import Via, open_bus
 from tumortrack_devices.ros.sensors import CAMERA_FRAME
 from tumortrack_devices.ros.tf import TRANSFORMS, transform_fields
 
@@ -49,7 +47,7 @@ class RosSink:
         self._results = ResultMessages(bus.messages, context, *options)
         self._last: TrackingResult | None = None
         self._cameras: dict[str, Affine] = {}  # those on /tf_static
-        self._static: Publisher | None = None
+        self._static: Publish | None = None
         if config.camera_tf and not context.published_frame.moves:
             self._static = bus.publisher("/tf_static", TRANSFORMS, latched=True)
         topic, kind = ACKNOWLEDGE
@@ -73,7 +71,7 @@ class RosSink:
         failed: list[str] = []
         for suffix, _, message in self._results.of(result):
             try:
-                self._publishers[suffix].publish(self._bus.messages.to_bytes(message))
+                self._publishers[suffix](self._bus.messages.to_bytes(message))
             except TumortrackError as error:
                 failed.append(str(error))
         if failed:
@@ -97,7 +95,7 @@ class RosSink:
             for name, pose in self._cameras.items()
         ]
         message = messages.make(TRANSFORMS, transforms=transforms)
-        self._static.publish(messages.to_bytes(message))
+        self._static(messages.to_bytes(message))
 
     def close(self) -> None:
         """Publish that tracking has ended, so that no estimate stays on a screen, and leave."""
@@ -108,9 +106,6 @@ class RosSink:
                 number, stamp_ns = last.sequence + 1, last.stamp_ns + 1
                 self.publish(TrackingResult(number, stamp_ns, reason=reason, published_frame=frame))
                 self._last = None
-                until_s = time.monotonic() + _FLUSH_S
-                for publisher in self._publishers.values():
-                    publisher.flush(max(0.0, until_s - time.monotonic()))
+                self._bus.flush(_FLUSH_S)
         finally:
-            self._publishers = {}
             self._bus.close()

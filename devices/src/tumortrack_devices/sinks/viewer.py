@@ -1,12 +1,11 @@
 """A web page that shows each estimate: ``viewer:8080?case=CASE_FOLDER``.
 
 The page says how good the estimate is, how old, or why there is none; without one, or after a
-second of silence, nothing of an older one stays visible. ``viewer.guard`` controls access.
+second of silence, nothing of an older one stays visible.
 """
 
 from __future__ import annotations
 
-import socket
 import threading
 import time
 from collections.abc import Iterable, Iterator
@@ -28,15 +27,12 @@ from tumortrack.imaging.case import load_case
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 from tumortrack.tracking.slices import CarriedCt, SlicePlane, outlined, plane_through
 from tumortrack_devices.display import seen_points
-from tumortrack_devices.network import is_loopback
 from tumortrack_devices.viewer.look import point_under
 from tumortrack_devices.viewer.panel import ABORTED, Panel, State, StatusPanel
 from tumortrack_devices.viewer.scene import ViewerScene
 
 if TYPE_CHECKING:
-    from viser import GuiEvent, SceneClickEvent, ViserServer
-
-    from tumortrack_devices.viewer.guard import Guard, GuardedConnection
+    from viser import GuiEvent, SceneClickEvent
 
 _STALE_S = 1.0
 _TICK_S = 0.2  # how often the age is updated and the slice renewed
@@ -46,17 +42,13 @@ _COARSER = 2  # the CT is sampled coarser: a pixel in the panel is less than a v
 # garbage collection, it may not run for a second.
 _PARKED_S = 5.0
 _SAME_ORGAN_MM = 3.0  # a case's surface may differ from the model's by so much
-_NOTICE_S = 5.0  # between two notices to a visitor who may only watch
 
 
 class ViewerSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
-    """A page at ``http://host:port``. Changing anything needs the address with the token, which is
-    printed at the start.
+    """A page at ``http://127.0.0.1:port``, for this machine alone.
 
     Attributes:
         port: 0: any free one.
-        host: who may watch, and stop arms: 127.0.0.1, this machine; 0.0.0.0, all that can reach it;
-            or a name of this machine, which is then allowed in the page's address.
         case: folder of the patient's case, of whose CT (or labels) slices are shown.
         margin_mm: a fixed distance of the shell around each tumor; 0: no shell; default: how far
             off the tumor is at most (95 %).
@@ -66,7 +58,6 @@ class ViewerSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
     target: ClassVar[str] = "port"
 
     port: int = 8080
-    host: str = "127.0.0.1"
     case: str = ""
     margin_mm: float | None = None
     hz: float = 15.0
@@ -85,29 +76,36 @@ class ViewerSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="viewer"):
 
 
 class ViewerSink:
-    """``port``: of the page; ``url``: its address with the token."""
+    """``port``, ``url``: of the page; ``server``: viser's; ``panel``: its elements."""
 
     def __init__(self, config: ViewerSinkConfig, context: SinkContext) -> None:
         self._ct = _load_ct(config.case, context) if config.case else None
         self._config, self._context = config, context
-        self._server, self._guard = _opened(config.host, config.port)
-        self.port: int = self._server.get_port()
-        self.url = f"{self._page_url()}/{self._guard.token}"
+        try:
+            from tumortrack_devices.viewer.server import HOST, LocalServer
+        except ImportError as error:
+            needed = to_install("tumortrack-devices")
+            raise InputError(f"the viewer needs viser: {needed}.") from error
+        self.server = LocalServer(config.port)
+        self.port: int = self.server.get_port()
+        self.url = f"http://{HOST}:{self.port}"
+        self.notes = (f"open {self.url}",)
         self._lock = threading.RLock()  # for every change of the page
         self._result: TrackingResult | None = None  # the latest
         self._drawn: TrackingResult | None = None  # the whole page shows this one
-        self._shown: TrackingResult | None = None  # the same, if its estimate is visible
+        # The same and its margins, if its estimate is visible.
+        self._shown: tuple[TrackingResult, dict[str, Mesh]] | None = None
         self._came_s = self._drawn_s = -np.inf
         self._hidden_count = 0  # a slice computed before the last hiding is invalid
         self._counter = 0
         self._fault: BaseException | None = None  # for the next publish to raise
         self._asked: bool | None = None  # for a click on the organ (True) or beside it
         self._state: State = "waiting"
-        self._server.scene.set_background_image(np.full((4, 4, 3), colours.BACKGROUND, np.uint8))
-        self._scene = ViewerScene(self._server, context, config.margin_mm)
+        self.server.scene.set_background_image(np.full((4, 4, 3), colours.BACKGROUND, np.uint8))
+        self._scene = ViewerScene(self.server, context, config.margin_mm)
         slices = "" if self._ct is None else self._ct.name
         options = slices, context.arms, str(context.patient), context.tools
-        self._panel = Panel(self._server, context.parts, *options)
+        self.panel = Panel(self.server, context.parts, *options)
         self._connect()
         self._say("waiting")
         self._closing = threading.Event()
@@ -116,7 +114,7 @@ class ViewerSink:
 
     def _connect(self) -> None:
         """Callbacks of the panel's elements; viser calls them from its own threads."""
-        panel = self._panel
+        panel = self.panel
 
         def changed(_: object) -> None:
             with self._page():
@@ -128,7 +126,6 @@ class ViewerSink:
         panel.clicks[False].on_click(lambda _: self._ask(False))
         panel.forget.on_click(lambda _: self._forget())
         panel.acknowledge.on_click(lambda _: self._context.controls.acknowledged.set())
-        self._guard.on_refused = self._refused
         if self._context.tools:
 
             @panel.touches.on_click
@@ -139,7 +136,6 @@ class ViewerSink:
 
         if self._context.arms:
             panel.abort.on_click(lambda _: self._abort())
-            self._guard.free[panel.abort._impl.uuid] = self._context.controls.aborted.set
 
             @panel.views.on_click
             def _(event: GuiEvent[Any]) -> None:
@@ -167,35 +163,7 @@ class ViewerSink:
         if not self._closing.is_set():
             self._closing.set()
             self._watch.join(5)
-            _close(self._server)
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        if is_loopback(self._config.host):
-            return (f"open {self.url}",)
-        power = "see the patient's organ" + (" and stop the arms" if self._context.arms else "")
-        return f"open {self.url}", (
-            f"anyone in this network can {power} at {self._page_url()}; nothing is encrypted. "
-            "Whoever has the longer address can change what is shown and tracked."
-        )
-
-    def _page_url(self) -> str:
-        host = self._config.host
-        host = socket.gethostname() if host in ("0.0.0.0", "::") else host
-        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}"
-
-    def _refused(self, connection: GuardedConnection) -> None:
-        """Tell a visitor without the token, but not at each movement of a slider."""
-        now = time.monotonic()
-        for client in self._server.get_clients().values():
-            known = self._server._websock_server._live_connections
-            if known.get(client.client_id) is connection and now >= connection.notice_due_s:
-                connection.notice_due_s = now + _NOTICE_S
-                client.add_notification(
-                    "This page only watches",
-                    "Use the address that tumortrack printed at its start to change something."
-                    + (" Stopping the arms works here too." if self._context.arms else ""),
-                )
+            self.server.stop()
 
     @contextmanager
     def _page(self) -> Iterator[None]:
@@ -209,7 +177,7 @@ class ViewerSink:
 
         with self._lock:
             with suppress(RuntimeError):  # it has ended
-                self._server.get_event_loop().call_soon_threadsafe(park)
+                self.server.get_event_loop().call_soon_threadsafe(park)
                 parked.wait(_PARKED_S)
             try:
                 yield
@@ -218,6 +186,9 @@ class ViewerSink:
 
     def _draw(self, result: TrackingResult) -> None:
         self._drawn = result
+        state: State = "playback" if result.playback else result.quality
+        if state != "good":  # a page gets 128 messages at once: a warning comes with the first
+            self._say(state)
         try:
             self._scene.show_cell(result.workcell)
         except Exception as error:
@@ -230,8 +201,9 @@ class ViewerSink:
                 self._scene.apply()
             else:
                 self._scene.show(result)
-                self._shown = result
-            self._say("playback" if result.playback else result.quality)
+                self._shown = result, self._scene.margins
+            if state == "good":
+                self._say(state)
         except Exception as error:
             self._hide()
             reason = f"this estimate cannot be shown ({error!r})"
@@ -243,7 +215,7 @@ class ViewerSink:
         self._shown = None
         self._hidden_count += 1
         self._scene.hide()
-        self._panel.put_slice(None)
+        self.panel.put_slice(None)
 
     def _say(self, state: State) -> None:
         self._state = state
@@ -252,13 +224,12 @@ class ViewerSink:
         if result is not None:
             since_s = self._came_s if state == "stale" else self._drawn_s
             age_s = time.monotonic() - since_s + (result.latency_ms or 0.0) / 1000
-        arms, parts = self._context.arms, self._context.parts
-        status = StatusPanel(state, result, age_s, self._counter, arms, parts)
-        self._panel.stage.content = status.stage()
+        about = age_s, self._counter, self._context.arms, self._context.parts
+        self.panel.stage.content = StatusPanel(state, result, *about).stage()
         finding = None if result is None else result.finding
         contradicted = finding is not None and finding.kind in ("evidence", "disputed")
-        if self._panel.acknowledge.visible is not contradicted:
-            self._panel.acknowledge.visible = contradicted
+        if self.panel.acknowledge.visible is not contradicted:
+            self.panel.acknowledge.visible = contradicted
 
     def _keep_watch(self) -> None:
         """Update the age, hide what is too old, renew the slice."""
@@ -279,20 +250,20 @@ class ViewerSink:
         if self._ct is None:
             return
         with self._lock:
-            result, hidden_count = self._shown, self._hidden_count
-            margins = self._scene.margins  # of that result
-            part, orientation = self._panel.through.value, self._panel.plane.value
-        if result is None or result.estimate is None:
+            shown, hidden_count = self._shown, self._hidden_count
+            part, orientation = self.panel.through.value, self.panel.plane.value
+        if shown is None or (estimate := shown[0].estimate) is None:
             return
-        plane = plane_through(result.estimate.meshes, part, orientation)
-        motion, picture = result.estimate.motion, None
+        result, margins = shown
+        plane = plane_through(estimate.meshes, part, orientation)
+        motion, picture = estimate.motion, None
         if plane is not None and motion is not None:
             outlines = self._outlines(result, margins)
             number = f"frame no. {result.sequence}"
             picture = slice_picture(self._ct, motion, plane, outlines, _SLICE_PIXELS, number)
         with self._page():
             if hidden_count == self._hidden_count:
-                self._panel.put_slice(picture)
+                self.panel.put_slice(picture)
                 if picture is not None and plane is not None:
                     pose = result.published_frame.published_from_camera
                     self._scene.put_slice(picture, plane, pose)
@@ -316,12 +287,12 @@ class ViewerSink:
         """The next click in the scene is on the organ, or beside it; asked twice: cancelled."""
         with self._lock:
             if self._asked is not None:
-                self._server.scene.remove_click_callback(self._clicked)
+                self.server.scene.remove_click_callback(self._clicked)
             self._asked = None if self._asked is organ else organ
             if self._asked is not None:
-                self._server.scene.on_click()(self._clicked)
+                self.server.scene.on_click()(self._clicked)
             self._scene.look_at_colours(self._asked is not None)
-            self._panel.say_clicks(self._asked, self._context.controls)
+            self.panel.say_clicks(self._asked, self._context.controls)
 
     def _clicked(self, event: SceneClickEvent) -> None:
         with self._lock:
@@ -348,18 +319,18 @@ class ViewerSink:
             if organ:
                 controls.picked_mm = place_mm
                 self._scene.mark(place_mm)
-            self._panel.say_clicks(None, controls)
+            self.panel.say_clicks(None, controls)
 
     def _forget(self) -> None:
         with self._lock:
             self._context.controls.forget()
             self._scene.mark(None)
-            self._panel.say_clicks(self._asked, self._context.controls)
+            self.panel.say_clicks(self._asked, self._context.controls)
 
     def _abort(self) -> None:
         with self._lock:
             self._context.controls.aborted.set()
-            self._panel.abort.label, self._panel.abort.disabled = ABORTED, True
+            self.panel.abort.label, self.panel.abort.disabled = ABORTED, True
 
 
 def _kind(result: TrackingResult) -> tuple[str, str, bool]:
@@ -389,63 +360,6 @@ def _load_ct(case: str, context: SinkContext) -> CarriedCt:
             f"differ by {apart:.1f} mm. Give that case."
         )
     return CarriedCt(loaded)
-
-
-def _opened(host: str, port: int) -> tuple[ViserServer, Guard]:
-    """A running server with an empty scene, on this very port; 0: any free one."""
-    try:
-        import viser
-
-        from tumortrack_devices.viewer.guard import Guard
-    except ImportError as error:
-        raise InputError(f"the viewer needs viser: {to_install('tumortrack-devices')}.") from error
-    taken = (
-        f"the viewer cannot listen on port {port} of {host}: another program does, or it may not "
-        f"be used. Close that, or choose another port: viewer:{port + 1}."
-    )
-    try:  # if the port is taken, viser silently uses another
-        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-        with socket.socket(family, socket.SOCK_STREAM) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server will
-            probe.bind((host, port))
-    except socket.gaierror as error:
-        raise InputError(
-            f"the viewer cannot listen at {host!r}: {error.strerror}. Give host=127.0.0.1 for this "
-            "machine alone, host=0.0.0.0 for every machine that can reach it."
-        ) from error
-    except OSError as error:
-        raise InputError(f"{taken} ({error.strerror})") from error
-    guard = Guard(host, f"viser-v{viser.__version__}")
-    with _silence(), guard.around_start():
-        server = viser.ViserServer(host=host, port=port, label="tumortrack", verbose=False)
-    # A change may be more than the 128 messages that viser sends at once; a first visit too.
-    server._websock_server._broadcast_buffer.max_window_size = 10_000
-    if not guard.installed:
-        _close(server)
-        raise InputError(f"viser {viser.__version__} cannot be guarded. Install viser 1.1.1.")
-    if port not in (0, server.get_port()):
-        _close(server)
-        raise InputError(taken)
-    return server, guard
-
-
-def _close(server: ViserServer) -> None:
-    """Stop it, its threads and its connections; browsers have up to 6 s to close."""
-    with _silence():
-        server.stop()
-
-
-@contextmanager
-def _silence() -> Iterator[None]:
-    """viser prints through rich's shared console when it starts and stops."""
-    import rich
-
-    console = rich.get_console()
-    before, console.quiet = console.quiet, True
-    try:
-        yield
-    finally:
-        console.quiet = before
 
 
 def slice_picture(

@@ -13,9 +13,8 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
 from tumortrack.live.values import Observation, SourceConfig, SourceLost
 from tumortrack_devices.ros import sensors
-from tumortrack_devices.ros.bus import Bus, Subscriber, check_topic
+from tumortrack_devices.ros.bus import Bus, Subscriber, Via, check_topic, open_bus
 from tumortrack_devices.ros.messages import stamp_of
-from tumortrack_devices.ros.ros2 import Via, open_bus
 
 _KINDS = {"image": sensors.IMAGE, "packed": sensors.COMPRESSED, "cloud": sensors.CLOUD}
 _PACKED = "/compressedDepth"  # image_transport appends it to the image's topic
@@ -114,7 +113,7 @@ class RosSource:
             if self._closed:
                 return False
             if not self._kind:
-                published = self._bus.types_of(self._topic)
+                published = self._bus.topics().get(self._topic, set())
                 wanted = set(_KINDS.values()) - ({sensors.CLOUD} if mask or picture else set())
                 usable = published & wanted
                 if len(usable) != 1 and final and published:

@@ -6,8 +6,7 @@ from typing import ClassVar
 
 from tumortrack.core.geometry import Affine
 from tumortrack.live.values import SinkContext
-from tumortrack_devices.ros.bus import check_topic
-from tumortrack_devices.ros.ros2 import Via, open_bus
+from tumortrack_devices.ros.bus import Via, check_topic, open_bus
 from tumortrack_devices.ros.tf import TfPoses
 from tumortrack_devices.tools.tip import TipConfig, TipTool
 

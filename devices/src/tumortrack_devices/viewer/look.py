@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from tumortrack.core.geometry import Affine, unit
 from tumortrack.core.mesh_query import contains
@@ -21,7 +20,7 @@ View = Literal["organ", "tools", "arms"]
 
 _FIRST_LOOK_MM = 130.0
 _FOV_RADIANS = 0.9  # vertically; more in a narrow page, to keep this horizontally:
-LEAST_ACROSS, _SAME_RADIANS = 0.8, 1e-3
+_LEAST_ACROSS, _SAME_RADIANS = 0.8, 1e-3
 _ROUND_CUTS_MM = 120.0  # shown around the cuts: the organ, both tools
 # Direction onto a workcell: from the front, somewhat from the left and above; its frame's z is up.
 _OVERVIEW_FROM, _UP = np.array([-0.45, -1.0, 0.6]), np.array([0.0, 0.0, 1.0])
@@ -41,7 +40,7 @@ class Viewpoint:
     def __init__(self, server: ViserServer, pose: Affine) -> None:
         self._server, self._pose = server, pose  # published_from_camera
         self._aimed = False
-        self._eye_mm, self._axes = pose[:3, 3], pose[:3, :3]  # of the visitor who moved last
+        self._eye_mm = pose[:3, 3]  # of the visitor who moved last
         self._organ_mm = pose[:3, 3] + _FIRST_LOOK_MM * pose[:3, 2]
         self._cell: Workcell | None = None  # the latest
         server.scene.set_up_direction(-pose[:3, 1])
@@ -123,17 +122,10 @@ class Viewpoint:
         line_mm = place_mm + steps_mm[:, None] * unit(way_mm)
         return any(contains(surface, line_mm).any() for surface in behind)
 
-    def seen_at(self, places_mm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
-        """Where the visitor who moved last sees places: right and down of the middle of the view,
-        as tangents of angles. Of one beside or behind the eye, its direction."""
-        right, down, away = ((places_mm - self._eye_mm) @ self._axes).T
-        return np.stack([right, down], axis=1) / np.maximum(away, _NEAR_MM)[:, None]
-
     def _follow(self, client: ClientHandle) -> None:
         def moved(camera: CameraHandle) -> None:
             self._eye_mm = camera.position
-            self._axes = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
-            across = 2 * np.arctan(np.tan(LEAST_ACROSS / 2) / camera.aspect)
+            across = 2 * np.arctan(np.tan(_LEAST_ACROSS / 2) / camera.aspect)
             if abs(camera.fov - (fov := max(_FOV_RADIANS, float(across)))) > _SAME_RADIANS:
                 camera.fov = fov
 

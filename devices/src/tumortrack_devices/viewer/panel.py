@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from html import escape
 from importlib.resources import files
 from string import Template
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import UInt8
@@ -65,8 +64,7 @@ _SILENCE = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class StatusPanel:
+class StatusPanel(NamedTuple):
     """The status of the shown result. ``age_s``: since its frame; ``counter``: of messages;
     ``arms``: there may be some; ``parts``: the model's, the organ first."""
 
@@ -77,20 +75,6 @@ class StatusPanel:
     arms: bool = False
     parts: tuple[str, ...] = ()
 
-    @property
-    def alarming(self) -> bool:
-        """There is no estimate. Arms that go on without one are meant to, as in a playback: else
-        they would be halted."""
-        cell = self._cell
-        return self.state in _EMPTY and (cell is None or bool(cell.halted))
-
-    @property
-    def _cell(self) -> Workcell | None:
-        """What the arms do, if that is current."""
-        if self.result is None or self.state in ("waiting", "stale"):
-            return None
-        return self.result.workcell
-
     def stage(self) -> str:
         """Everything, in one piece that the page shows at once: in the panel (``flag``,
         ``numbers``) and over the scene (``over``)."""
@@ -99,39 +83,41 @@ class StatusPanel:
         return f'<div class="tumortrack-stage" hidden data-n="{self.counter}">{inside}</div>'
 
     def flag(self) -> str:
-        """Quality and frame number; the arms' state."""
-        heading, colour = self._heading
-        return _box(heading, colour, self._number()) + (self._arms()[0] if self.arms else "")
-
-    @property
-    def _heading(self) -> tuple[str, Colour]:
+        """Quality and frame number; the arms' state, or why they are halted."""
         shape, colour = _SIGNS[self.state]
-        return f"{shape} {self.state.upper()}", colour
+        quality = _box(f"{shape} {self.state.upper()}", colour, self._number)
+        if not self.arms:
+            return quality
+        if (cell := self._cell) is None:
+            return quality + _box("ARMS: nothing is known of them", colours.STALE)
+        text, colour = _arms_sign(cell)
+        return quality + _box(f"ARMS: {text}", colour, cell.halted or cell.left)
 
     def _over_scene(self) -> str:
-        """A banner with the reason; if alarming, the whole page in its colour; the watch."""
-        heading, colour = self._heading
-        tint, size = "", "quiet" if self.state == "good" else "plain"
-        if self.alarming:
-            size = "loud"
-            style = f"background:{css(colour)}48;color:{css(colour)}"
+        """A banner with the reason, and one of the arms; the watch. Without an estimate the whole
+        page is in its colour, unless arms go on: they are meant to, as in a playback."""
+        shape, colour = _SIGNS[self.state]
+        cell, size, tint = self._cell, "quiet" if self.state == "good" else "plain", ""
+        if self.state in _EMPTY and (cell is None or cell.halted):
+            style, size = f"background:{css(colour)}48;color:{css(colour)}", "loud"
             tint = f"<div class='tumortrack-tint' style='{style}'></div>"
-        why = f"{self._number()}: {self._reason()}"
-        banner = _over("top", size, colour, heading, why.removeprefix(": "))
-        return tint + banner + (self._arms()[1] if self.arms else "") + _SILENCE
+        why = f"{self._number}: {self._reason()}".removeprefix(": ")
+        banner = tint + _over("top", size, colour, f"{shape} {self.state.upper()}", why)
+        if self.arms and cell is not None:
+            text, colour = _arms_sign(cell)
+            banner += _over("bottom", "plain", colour, text, cell.halted)
+        return banner + _SILENCE
 
+    @property
+    def _cell(self) -> Workcell | None:
+        """What the arms do, if that is current."""
+        if self.result is None or self.state in ("waiting", "stale"):
+            return None
+        return self.result.workcell
+
+    @property
     def _number(self) -> str:
         return "" if self.result is None else f"frame no. {self.result.sequence}"
-
-    def _arms(self) -> tuple[str, str]:
-        """Their state, or why they are halted: in the panel, and over the scene."""
-        cell = self._cell
-        if cell is None:
-            return _box("ARMS: nothing is known of them", colours.STALE), ""
-        colour = colours.NONE if cell.halted else colours.ARMS
-        text = f"{cell.state}: HALTED" if cell.halted else cell.state
-        box = _box(f"ARMS: {text}", colour, cell.halted or cell.left)
-        return box, _over("bottom", "plain", colour, text, cell.halted)
 
     def _reason(self) -> str:
         if self.state == "waiting":
@@ -183,6 +169,10 @@ class StatusPanel:
             ]
             rows.append(f"<tr><td>{'</td><td>'.join(cells)}</td></tr>")
         return f"<table><tr><th>{'</th><th>'.join(heads)}</th></tr>{''.join(rows)}</table>"
+
+
+def _arms_sign(cell: Workcell) -> tuple[str, Colour]:
+    return (f"{cell.state}: HALTED", colours.NONE) if cell.halted else (cell.state, colours.ARMS)
 
 
 def _over(edge: str, size: str, colour: Colour, text: str, why: str) -> str:

@@ -21,10 +21,9 @@ from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.live import values as live
 from tumortrack.live.values import TrackingResult, TransformedEstimate
 from tumortrack.tracking.slices import SlicePlane
-from tumortrack_devices.beside import Beside, NextTouch
+from tumortrack_devices.beside import Beside
 from tumortrack_devices.display import MOST_SEEN, seen_colours, seen_points, thinned, wxyz_of
-from tumortrack_devices.viewer.arrange import ANCHORS, arranged
-from tumortrack_devices.viewer.look import LEAST_ACROSS, Viewpoint
+from tumortrack_devices.viewer.look import Viewpoint
 
 if TYPE_CHECKING:
     from viser import MeshHandle, PointCloudHandle, ViserServer
@@ -34,10 +33,8 @@ _TUMOR_WITH_POINTS = 0.3  # opacity
 _SEEN_MM, _ORGAN_MM = 0.15, 0.15  # size of points: small, they lie over the tumors
 _CLICKABLE_MM = 1.0  # of observed points, while a click is expected
 _TOUCH_MM, _KNOWN_MM, _CONTRADICTING_MM = 2.0, 1.2, 1.8  # radii of their points
-_MOST_TOUCHES = 3  # of what to touch next: with labels
-# Room for a label with its frame, pixels for each character and row, in a page as narrow as a
-# phone's: in larger ones labels cover less of the view.
-_LETTER, _LINE, _FRAME, _PHONE = 7.0, 18.0, 6.0, (390.0, 560.0)
+# Which corner of its label lies at a place to touch next, the best first: apart from each other.
+_CORNERS_AT: tuple[Any, ...] = ("bottom-left", "top-left", "top-right")
 _SAME_MM = 0.4  # between surfaces that coincide
 _NO_POINTS = np.zeros((0, 3), np.float32)
 _NOTHING = Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]]))
@@ -119,8 +116,8 @@ class ViewerScene:
             ),
         }
         self._labels = [
-            nodes.add_label(f"/estimate/next_{n}", "", visible=False, anchor=ANCHORS[0])
-            for n in range(_MOST_TOUCHES)
+            nodes.add_label(f"/estimate/next_{n}", "", visible=False, anchor=corner)
+            for n, corner in enumerate(_CORNERS_AT)
         ]
         clear = np.zeros((2, 2, 4), np.uint8)
         self._slice = nodes.add_image("/estimate/slice", clear, 1, 1, format="png", **_FLAT)
@@ -336,17 +333,6 @@ class ViewerScene:
             label.visible = False
         for label, touch in zip(self._labels, touches, strict=False):
             label.text, label.position = touch.label, touch.place_mm
-        self._hang([n for n, in_sight in enumerate(self._in_sight) if in_sight], touches)
-
-    def _hang(self, numbers: list[int], touches: Sequence[NextTouch]) -> None:
-        """Labels that are seen, so that none covers another."""
-        places = self.look.seen_at(np.reshape([touches[n].place_mm for n in numbers], (-1, 3)))
-        pixel = 2 * np.tan(LEAST_ACROSS / 2) / _PHONE[0]
-        sizes = [(_LETTER * len(touches[n].label) + _FRAME, _LINE) for n in numbers]
-        sides = pixel * np.reshape(sizes, (-1, 2)), pixel * np.array(_PHONE) / 2
-        before = [self._labels[n].anchor for n in numbers]
-        for n, anchor in zip(numbers, arranged(places, *sides, before), strict=True):  # type: ignore[arg-type]
-            self._labels[n].anchor = anchor
 
     def _margins_of(self, result: TrackingResult, estimate: TransformedEstimate) -> dict[str, Mesh]:
         assert result.estimate is not None
