@@ -1,9 +1,9 @@
 """The pixels of DICOM slices, beside SimpleITK's reader; and what no reader could know."""
 
-import re
-
 import numpy as np
+import pydicom
 import pytest
+from pydicom.encaps import encapsulate, get_frame
 
 from dicom_objects import SYNTAXES, packed, write_slices
 from tumortrack.core.errors import InputError
@@ -12,13 +12,12 @@ from tumortrack.imaging.dicom import read_dicom
 COMPRESSED = ("rle", "jpeg lossless", "jpeg-ls", "jpeg 2000")
 
 
-def numbers(kind, bits, seed=0):
+def numbers(kind, bits):
     """All the values that so many bits can hold at random places, and a smooth part; the lowest and
     the highest first."""
-    signed = np.dtype(kind).kind == "i"
-    lowest = -(2 ** (bits - 1)) if signed else 0
+    lowest = -(2 ** (bits - 1)) if np.dtype(kind).kind == "i" else 0
     highest = lowest + 2**bits - 1
-    out = np.random.default_rng(seed).integers(lowest, highest + 1, (24, 20, 11))
+    out = np.random.default_rng(0).integers(lowest, highest + 1, (24, 20, 11))
     out[12:] = np.clip(np.arange(12)[:, None, None] * 3 + np.arange(20)[:, None], lowest, highest)
     out[0, 0], out[1, 0] = lowest, highest
     return out.astype(kind)
@@ -63,55 +62,46 @@ def test_padding_and_long_values_are_left_as_they_are(tmp_path, capfd, recwarn):
         data.add_new("PixelPaddingValue", "SS", -200)
         data.PixelData += bytes(2500)  # room for two more frames
 
-    stored = numbers("<i2", 16)
-    paths = write_slices(tmp_path, stored, change=change)
+    paths = write_slices(tmp_path, numbers("<i2", 16), change=change)
     assert np.array_equal(read_dicom(tmp_path).array, by_simpleitk(paths))
     assert not recwarn.list
     assert capfd.readouterr().err == ""
 
 
-def test_what_the_tags_leave_open_is_refused(tmp_path):
-    """MONOCHROME1 is inverted by GDCM and not by others; both ignore a high bit elsewhere."""
-    for tag, value in (
-        ("PhotometricInterpretation", "MONOCHROME1"),
+@pytest.mark.parametrize(
+    ("tag", "value"),
+    [
+        ("PhotometricInterpretation", "MONOCHROME1"),  # inverted by GDCM and not by others
         ("PhotometricInterpretation", "YBR_FULL"),
-        ("HighBit", 13),
-    ):
-        folder = tmp_path / f"{tag} {value}"
-        write_slices(folder, numbers("<u2", 12), 12, lambda data: setattr(data, tag, value))  # noqa: B023
-        with pytest.raises(InputError, match=f"cannot be decoded: {tag} {value}"):
-            read_dicom(folder)
+        ("HighBit", 13),  # ignored by both
+    ],
+)
+def test_what_the_tags_leave_open_is_refused(tmp_path, tag, value):
+    write_slices(tmp_path, numbers("<u2", 12), 12, lambda data: setattr(data, tag, value))
+    with pytest.raises(InputError, match=f"{tag} {value}"):
+        read_dicom(tmp_path)
 
 
 @pytest.mark.parametrize("syntax", COMPRESSED)
-def test_a_cut_picture_is_refused_in_one_line(syntax, tmp_path, capfd, recwarn):
+def test_a_picture_that_is_cut_or_of_another_size_is_refused(syntax, tmp_path, capfd, recwarn):
     """With the length that its elements claim made true: a decoder fills up what is missing."""
-    import pydicom
-    from pydicom.encaps import encapsulate, get_frame
-
     paths = write_slices(tmp_path, numbers("<u2", 12), 12)
     for path in paths:
         packed(path, syntax)
+    whole = paths[4].read_bytes()
     data = pydicom.dcmread(paths[4])
     frame = get_frame(data.PixelData, 0, number_of_frames=1)
     data.PixelData = encapsulate([frame[: len(frame) * 3 // 4]])
     data.save_as(paths[4])
-    with pytest.raises(InputError, match=re.escape(str(paths[4]))) as refused:
+    with pytest.raises(InputError, match=paths[4].name) as refused:
         read_dicom(tmp_path)
     assert len(str(refused.value).splitlines()) == 1
     assert not recwarn.list
     assert capfd.readouterr().err == ""
-
-
-@pytest.mark.parametrize("syntax", COMPRESSED)
-def test_a_picture_of_another_size_is_refused(syntax, tmp_path):
-    import pydicom
-
-    paths = write_slices(tmp_path, numbers("<u2", 12), 12)
+    paths[4].write_bytes(whole)
     for path in paths:
-        packed(path, syntax)
         data = pydicom.dcmread(path)
         data.Rows, data.Columns = data.Columns, data.Rows - 4
         data.save_as(path)
-    with pytest.raises(InputError, match="cannot be decoded"):
+    with pytest.raises(InputError):
         read_dicom(tmp_path)

@@ -56,30 +56,26 @@ def test_a_small_tumor_keeps_its_volume(voxel):
     assert solid(anatomy.parts[1]).is_volume
 
 
-@pytest.mark.parametrize("mirror", [1.0, -1.0])
-def test_orientation_of_the_grid_changes_nothing(mirror):
-    labels = kidney_labels()
-    turn = np.eye(4)
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_orientation_of_the_grid_changes_nothing(mirrored):
+    labels, turn, flip = kidney_labels(), np.eye(4), np.eye(4)
     turn[:3, :3] = OBLIQUE
-    flip = np.diag([mirror, 1, 1, 1])
-    flip[0, 3] = labels.labels.shape[0] - 1 if mirror < 0 else 0
-    array = labels.labels[::-1] if mirror < 0 else labels.labels
+    if mirrored:
+        flip[0, [0, 3]] = -1, labels.labels.shape[0] - 1
+    array = labels.labels[::-1] if mirrored else labels.labels
     anatomy, _ = surfaces(LabelVolume(array, turn @ labels.lps_from_index @ flip))
-    reference, _ = surfaces(labels)
-    assert anatomy.organ.volume_mm3 == pytest.approx(reference.organ.volume_mm3, rel=1e-3)
-    for a, b in zip(anatomy.parts, reference.parts, strict=True):
+    for a, b in zip(anatomy.parts, surfaces(labels)[0].parts, strict=True):
         assert solid(a).is_volume
-        back = solid(a).center_mass @ OBLIQUE
-        assert back == pytest.approx(solid(b).center_mass, abs=0.05)
+        assert a.volume_mm3 == pytest.approx(b.volume_mm3, rel=1e-3)
+        assert solid(a).center_mass @ OBLIQUE == pytest.approx(solid(b).center_mass, abs=0.05)
 
 
 def test_unusable_labels_are_refused():
-    with pytest.raises(InputError, match="empty"):
-        surfaces(LabelVolume(np.zeros((5, 5, 5)), np.eye(4)))
     gap = kidney_labels().labels.copy()
     gap[gap == 2] = 1
-    with pytest.raises(InputError, match="tumor_1"):
-        surfaces(LabelVolume(gap, np.eye(4)))
+    for labels in (np.zeros((5, 5, 5)), gap):
+        with pytest.raises(InputError):
+            surfaces(LabelVolume(labels, np.eye(4)))
 
 
 @pytest.mark.parametrize(("slice_mm", "most"), [(1.0, 20.0), (3.0, 20.0)])

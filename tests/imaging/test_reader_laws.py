@@ -1,35 +1,46 @@
 """Laws that hold whatever the file: nothing is dropped or taken for a tumor without a word, an
 organ at the image's border is told, tolerances are stated, segments may overlap, names decide."""
 
+from __future__ import annotations
+
 import gzip
-import json
 import os
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import nibabel
 import numpy as np
+import pydicom
 import pytest
+import trimesh
 
 from imaging_objects import kidney_labels, write_dicom, write_nifti
 from tumortrack.core import store
 from tumortrack.core.config import findings_in
 from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import RAS_FROM_LPS, transform_points
+from tumortrack.core.mesh_files import write_mesh
 from tumortrack.core.types import LabelVolume, Volume
 from tumortrack.imaging.case import load_case, save_case
 from tumortrack.imaging.options import PrepareOptions
 from tumortrack.imaging.prepare import prepare
+from tumortrack.imaging.segmentation_files import segments, write_dicom_seg
 from tumortrack.imaging.segments import is_organ, is_tumor
+from tumortrack.imaging.surface import surface_of
 from tumortrack.imaging.volume import read_raw, read_several
+from tumortrack.phantom.dicom import write_dicom_series
 from tumortrack.phantom.digital import PhantomParameters, phantom_labels
 
 VOXEL_MM = 2.4
-KIDNEY_ML, TUMORS_ML = 185.15, (28.8, 17.1)  # of the labels; in its CT 180.12, 28.79, 17.40
+KIDNEY_ML, TUMORS_ML = 185.15, (28.8, 17.1)  # of the labels
 OTHER_ML = 4 / 3 * np.pi * 11**3 / 1000  # of a ball
+NAMES = ("kidney", "tumor_1", "tumor_2")
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Masks by name, on one grid."""
+    """Masks by name, on one grid; numbered in their order, if ``numbers`` says nothing else."""
 
     masks: dict[str, np.ndarray]
     affine: np.ndarray
@@ -45,22 +56,32 @@ class Scene:
             out[mask] = self.number(name)
         return out
 
+    def of(self, *names: str, **more: np.ndarray) -> Scene:
+        """These of its masks, and more."""
+        return Scene({name: self.masks[name] for name in names} | more, self.affine)
+
+    def hu(self) -> np.ndarray:
+        return np.choose(self.map(), [-1000, 40, 570, 570]).astype(np.int16)
+
 
 @pytest.fixture(scope="module")
 def phantom() -> Scene:
     volume = phantom_labels(PhantomParameters(), VOXEL_MM)
     labels = np.pad(volume.labels, 8)
-    affine = volume.lps_from_index.copy()
-    affine[:3, 3] -= 8 * VOXEL_MM
     masks = {"kidney": labels > 0, "tumor_a": labels == 2, "tumor_b": labels == 3}
-    return Scene(masks, affine)
+    return Scene(masks, moved(volume.lps_from_index, -8))
+
+
+def moved(affine: np.ndarray, voxels: float) -> np.ndarray:
+    out = affine.copy()
+    out[:3, 3] += affine[:3, :3] @ ([voxels] * 3)
+    return out
 
 
 def with_ball(scene: Scene, name: str, out_mm: float, radius_mm: float = 11.0) -> Scene:
     """A ball beside the kidney's side, whose middle lies ``out_mm`` outside of it, to the right."""
     kidney = scene.masks["kidney"]
-    index = np.indices(kidney.shape).reshape(3, -1)
-    places = (scene.affine[:3, :3] @ index).T + scene.affine[:3, 3]
+    places = transform_points(scene.affine, np.indices(kidney.shape).reshape(3, -1).T.astype(float))
     middle = places[kidney.ravel()].mean(0)
     row = np.abs(places[:, 1:] - middle[1:]).max(1) < VOXEL_MM / 1.5
     middle[0] = places[row & kidney.ravel(), 0].min() - out_mm
@@ -73,34 +94,31 @@ def nifti(scene: Scene, folder: Path) -> Path:
     return folder / "map.nii.gz"
 
 
-def nrrd_head(scene: Scene, sizes: str, lead: str, segments: str = "") -> bytes:
+def write_layers(path: Path, scene: Scene, array: np.ndarray, fields: str = "") -> Path:
     i, j, k, origin = (",".join(map(str, c)) for c in scene.affine[:3].T.tolist())
-    return (
-        f"NRRD0004\ntype: unsigned char\ndimension: {len(sizes.split())}\n"
-        f"space: left-posterior-superior\nsizes: {sizes}\n"
-        f"space directions: {lead}({i}) ({j}) ({k})\nencoding: gzip\n"
-        f"space origin: ({origin})\n{segments}\n"
-    ).encode()
+    head = (
+        f"NRRD0004\ntype: unsigned char\ndimension: {array.ndim}\n"
+        f"space: left-posterior-superior\nsizes: {' '.join(map(str, array.shape))}\n"
+        f"space directions: {'none ' * (array.ndim - 3)}({i}) ({j}) ({k})\nencoding: gzip\n"
+        f"space origin: ({origin})\n{fields}\n"
+    )
+    path.write_bytes(head.encode() + gzip.compress(array.tobytes(order="F")))
+    return path
 
 
 def nrrd(scene: Scene, folder: Path) -> Path:
-    labels = scene.map()
-    head = nrrd_head(scene, " ".join(map(str, labels.shape)), "")
-    (folder / "map.nrrd").write_bytes(head + gzip.compress(labels.tobytes(order="F")))
-    return folder / "map.nrrd"
+    return write_layers(folder / "map.nrrd", scene, scene.map())
 
 
 def seg_nrrd(scene: Scene, folder: Path, names: tuple[str, ...] = ()) -> Path:
     """Each segment in a layer of its own, as Slicer writes segments that overlap."""
-    layers = np.stack([*scene.masks.values()]).astype(np.uint8)
     fields = "".join(
         f"Segment{n}_ID:=Segment_{n}\nSegment{n}_Name:={name}\nSegment{n}_LabelValue:=1\n"
         f"Segment{n}_Layer:={n}\n"
         for n, name in enumerate(names or scene.masks)
     )
-    head = nrrd_head(scene, " ".join(map(str, layers.shape)), "none ", fields)
-    (folder / "map.seg.nrrd").write_bytes(head + gzip.compress(layers.tobytes(order="F")))
-    return folder / "map.seg.nrrd"
+    layers = np.stack([*scene.masks.values()]).astype(np.uint8)
+    return write_layers(folder / "map.seg.nrrd", scene, layers, fields)
 
 
 def files(scene: Scene, folder: Path) -> Path:
@@ -113,9 +131,6 @@ def files(scene: Scene, folder: Path) -> Path:
 
 
 def meshes(scene: Scene, folder: Path) -> Path:
-    from tumortrack.core.mesh_files import write_mesh
-    from tumortrack.imaging.surface import surface_of
-
     (folder / "meshes").mkdir()
     for name, mask in scene.masks.items():
         mesh = surface_of(name, mask, scene.affine, VOXEL_MM, keep=lambda whole: whole)
@@ -124,14 +139,20 @@ def meshes(scene: Scene, folder: Path) -> Path:
 
 
 NUMBERED, NAMED = {"nifti": nifti, "nrrd": nrrd}, {"seg.nrrd": seg_nrrd, "files": files}
-READERS = {**NUMBERED, **NAMED, "meshes": meshes}
-every = pytest.mark.parametrize("write", READERS.values(), ids=READERS)
-numbered = pytest.mark.parametrize("write", NUMBERED.values(), ids=NUMBERED)
-named = pytest.mark.parametrize("write", NAMED.values(), ids=NAMED)
+LABELS = {**NUMBERED, **NAMED}
+READERS = {**LABELS, "meshes": meshes}
+every, labelled, numbered, named = (
+    pytest.mark.parametrize("write", group.values(), ids=group)
+    for group in (READERS, LABELS, NUMBERED, NAMED)
+)
 
 
 def volumes(case) -> list[float]:
     return [part.volume_ml for part in case.anatomy.parts]
+
+
+def ml(*expected: float, rel: float = 0.015):
+    return pytest.approx(list(expected), rel=rel)
 
 
 def kinds(case) -> dict[str, dict]:
@@ -149,14 +170,14 @@ def test_the_phantom_is_the_phantom_by_every_reader_and_nothing_is_warned_of(
     phantom, tmp_path, write
 ):
     case = prepare(write(phantom, tmp_path))
-    assert volumes(case) == pytest.approx([KIDNEY_ML, *TUMORS_ML], rel=0.015)
+    assert volumes(case) == ml(KIDNEY_ML, *TUMORS_ML)
     assert case.warnings == ()
 
 
-@pytest.mark.parametrize("write", [*NUMBERED.values(), *NAMED.values()], ids=[*NUMBERED, *NAMED])
+@labelled
 def test_an_organ_at_the_border_is_told_and_stays_told(phantom, tmp_path, write):
     middle = phantom.map().shape[2] // 2
-    half = replace(phantom, masks={k: mask[..., :middle] for k, mask in phantom.masks.items()})
+    half = Scene({k: mask[..., :middle] for k, mask in phantom.masks.items()}, phantom.affine)
     case = prepare(write(half, tmp_path))
     cut = kinds(case)["cut"]
     voxels = int(half.masks["kidney"][..., -1].sum())
@@ -164,8 +185,7 @@ def test_an_organ_at_the_border_is_told_and_stays_told(phantom, tmp_path, write)
     assert cut["area_cm2"] == pytest.approx(voxels * VOXEL_MM**2 / 100, rel=0.015)
     with store.new_folder(tmp_path / "case") as aside:
         save_case(case, aside)
-    again = load_case(tmp_path / "case").warnings
-    assert [(w.kind, w.values) for w in again] == [(w.kind, w.values) for w in case.warnings]
+    assert kinds(load_case(tmp_path / "case")) == kinds(case)
 
 
 def test_a_ct_that_ends_in_the_organ_is_refused(tmp_path):
@@ -173,30 +193,21 @@ def test_a_ct_that_ends_in_the_organ_is_refused(tmp_path):
     first = int(np.flatnonzero(truth.labels.any((0, 1)))[0]) + 1
     hu = np.choose(truth.labels[..., first:], [-1000, 40, 570, 570])
     write_dicom(tmp_path / "ct", hu, truth.lps_from_index)
-    with pytest.raises(InputError, match="the image's end"):
+    with pytest.raises(InputError):
         prepare(tmp_path / "ct")
 
 
-def test_a_case_of_before_has_no_warnings(phantom, tmp_path):
-    case = prepare(nifti(phantom, tmp_path))
-    with store.new_folder(tmp_path / "case") as aside:
-        save_case(case, aside)
-    path = tmp_path / "case" / store.MANIFEST
-    manifest = json.loads(path.read_text())
-    del manifest["warnings"]
-    path.write_text(json.dumps(manifest))
-    assert load_case(tmp_path / "case").warnings == ()
+@pytest.mark.parametrize("kind", ["of_another_version", "cut"])
+def test_warnings_of_another_version_are_refused(kind):
     with pytest.raises(InputError):
-        findings_in([{"kind": "of_another_version", "values": {}}], "x")
-    with pytest.raises(InputError):
-        findings_in([{"kind": "cut", "values": {}}], "x")
+        findings_in([{"kind": kind, "values": {}}], "x")
 
 
 @every
 def test_a_body_apart_is_dropped_with_its_ml(phantom, tmp_path, write):
     scene = with_ball(phantom, "apart", 20.0)
-    both = {**phantom.masks, "kidney": scene.masks["kidney"] | scene.masks["apart"]}
-    case = prepare(write(replace(phantom, masks=both), tmp_path))
+    both = scene.masks["kidney"] | scene.masks["apart"]
+    case = prepare(write(replace(phantom, masks={**phantom.masks, "kidney": both}), tmp_path))
     assert volumes(case)[0] == pytest.approx(KIDNEY_ML, rel=0.015)
     assert kinds(case)["dropped"]["ml"] == pytest.approx(OTHER_ML, rel=0.1)
 
@@ -204,65 +215,62 @@ def test_a_body_apart_is_dropped_with_its_ml(phantom, tmp_path, write):
 @every
 def test_the_pieces_of_one_tumor_are_tumors(phantom, tmp_path, write):
     both = phantom.masks["tumor_a"] | phantom.masks["tumor_b"]
-    scene = replace(phantom, masks={"kidney": phantom.masks["kidney"], "tumor": both})
-    case = prepare(write(scene, tmp_path))
-    assert volumes(case) == pytest.approx([KIDNEY_ML, *TUMORS_ML], rel=0.015)
+    case = prepare(write(phantom.of("kidney", tumor=both), tmp_path))
+    assert volumes(case) == ml(KIDNEY_ML, *TUMORS_ML)
 
 
-@pytest.mark.parametrize("write", [*NUMBERED.values(), *NAMED.values()], ids=[*NUMBERED, *NAMED])
+@labelled
 def test_what_touches_and_nobody_named_is_left_out_with_its_ml_or_counts_if_asked(
     phantom, tmp_path, write
 ):
     """A cyst on the surface, half outside."""
     scene = with_ball(phantom, "cyst", 0.0)
-    path, ml = write(scene, tmp_path), float(scene.masks["cyst"].sum()) * VOXEL_MM**3 / 1000
-    number = {name: scene.number(name) for name in scene.masks}
-    if path.is_dir():  # numbered by name
-        number = {name: n for n, name in enumerate(sorted(scene.masks), 1)}
-    stated = PrepareOptions(organ=number["kidney"], tumor=(number["tumor_a"], number["tumor_b"]))
+    path, cyst_ml = write(scene, tmp_path), float(scene.masks["cyst"].sum()) * VOXEL_MM**3 / 1000
+    names = sorted(scene.masks) if path.is_dir() else list(scene.masks)  # as they are numbered
+    kidney, a, b, cyst = (names.index(name) + 1 for name in scene.masks)
+    stated = PrepareOptions(organ=kidney, tumor=(a, b))
     case = prepare(path, stated)
-    assert volumes(case) == pytest.approx([KIDNEY_ML, *TUMORS_ML], rel=0.015)
+    assert volumes(case) == ml(KIDNEY_ML, *TUMORS_ML)
     beside = kinds(case)["beside"]
-    assert beside["label"] == number["cyst"]
-    assert beside["ml"] == pytest.approx(ml)
-    case = prepare(path, replace(stated, organ=(number["kidney"], number["cyst"])))
-    assert volumes(case) == pytest.approx([KIDNEY_ML + ml, *TUMORS_ML], rel=0.015)
+    assert (beside["label"], beside["ml"]) == (cyst, pytest.approx(cyst_ml))
+    case = prepare(path, replace(stated, organ=(kidney, cyst)))
+    assert volumes(case) == ml(KIDNEY_ML + cyst_ml, *TUMORS_ML)
     assert case.warnings == ()
 
 
 @numbered
-@pytest.mark.parametrize("numbers", [{"kidney": 2, "tumor_a": 1, "tumor_b": 3}])
-def test_a_tumor_that_nobody_named_is_asked_for_and_never_filled(phantom, tmp_path, write, numbers):
-    path = write(replace(phantom, numbers=numbers), tmp_path)
+def test_a_tumor_that_nobody_named_is_asked_for_and_never_filled(phantom, tmp_path, write):
+    path = write(replace(phantom, numbers={"kidney": 2, "tumor_a": 1}), tmp_path)
     with pytest.raises(InputError, match="--tumor 1"):
         prepare(path, PrepareOptions(organ=2))
     case = prepare(path, PrepareOptions(organ=2, tumor=(1, 3)))
-    assert volumes(case) == pytest.approx([KIDNEY_ML, *TUMORS_ML[::1]], rel=0.015)
+    assert volumes(case) == ml(KIDNEY_ML, *TUMORS_ML)
     assert len(prepare(path, PrepareOptions(organ=2, tumor=0)).anatomy.parts) == 1
 
 
 @numbered
 def test_of_a_map_of_many_organs_only_the_named_one_is_taken(phantom, tmp_path, write):
-    scene = with_ball(phantom, "liver", 20.0, 25.0)
-    masks = {"spleen": np.zeros_like(scene.masks["kidney"]), "kidney": phantom.masks["kidney"]}
-    masks["liver"] = scene.masks["liver"]
-    case = prepare(write(replace(scene, masks=masks), tmp_path), PrepareOptions(organ=2))
-    assert volumes(case) == pytest.approx([KIDNEY_ML], rel=0.015)
-    ml = float(masks["liver"].sum()) * VOXEL_MM**3 / 1000
-    assert kinds(case)["beside"] == pytest.approx({"label": 3, "name": "", "ml": ml})
+    liver = with_ball(phantom, "liver", 20.0, 25.0).masks["liver"]
+    masks = {"spleen": np.zeros_like(liver), "kidney": phantom.masks["kidney"], "liver": liver}
+    case = prepare(write(replace(phantom, masks=masks), tmp_path), PrepareOptions(organ=2))
+    assert volumes(case) == ml(KIDNEY_ML)
+    liver_ml = float(liver.sum()) * VOXEL_MM**3 / 1000
+    assert kinds(case)["beside"] == pytest.approx({"label": 3, "name": "", "ml": liver_ml})
 
 
 @named
 def test_names_decide_not_the_order(phantom, tmp_path, write):
-    order = {"tumor_b": 0, "liver": 1, "kidney_left": 2, "tumor_a": 3}
     scene = with_ball(phantom, "liver", 20.0, 15.0)
     masks = {**scene.masks, "kidney_left": scene.masks["kidney"]}
+    order = ("tumor_b", "liver", "kidney_left", "tumor_a")
     path = write(replace(scene, masks={name: masks[name] for name in order}), tmp_path)
     case = prepare(path)
     assert volumes(case)[0] == pytest.approx(KIDNEY_ML, rel=0.015)
-    assert sorted(volumes(case)[1:]) == pytest.approx(sorted(TUMORS_ML), rel=0.015)
-    with pytest.raises(InputError, match="none is a prostate"):
+    assert sorted(volumes(case)[1:]) == ml(*sorted(TUMORS_ML))
+    with pytest.raises(InputError, match="prostate"):
         prepare(path, PrepareOptions(name="prostate"))
+    with pytest.raises(InputError, match="--side"):
+        prepare(path, PrepareOptions(side="right"))
     carried = prepare(path, PrepareOptions(structure=("hepar=liver",)))
     assert list(carried.anatomy.structures) == ["hepar"]
 
@@ -270,23 +278,23 @@ def test_names_decide_not_the_order(phantom, tmp_path, write):
 def test_one_name_twice_is_one_organ_and_one_label_twice_is_refused(phantom, tmp_path):
     kidney = phantom.masks["kidney"]
     upper = np.arange(kidney.shape[2]) >= kidney.shape[2] // 2
-    scene = replace(phantom, masks={"a": kidney & upper, "b": kidney & ~upper})
+    scene = phantom.of(a=kidney & upper, b=kidney & ~upper)
     path = seg_nrrd(scene, tmp_path, ("Kidney", "Kidney"))
-    assert volumes(prepare(path)) == pytest.approx([KIDNEY_ML], rel=0.015)
+    assert volumes(prepare(path)) == ml(KIDNEY_ML)
     path.write_bytes(path.read_bytes().replace(b"Segment1_Layer:=1", b"Segment1_Layer:=0"))
-    with pytest.raises(InputError, match="both label 1"):
+    with pytest.raises(InputError, match="label 1"):
         prepare(path)
 
 
 def test_several_files_in_one_call_and_a_tumors_file_alone(phantom, tmp_path):
     folder = files(phantom, tmp_path)
     paths = [folder / f"{name}.nii.gz" for name in ("tumor_a", "kidney")]
-    assert volumes(prepare(paths)) == pytest.approx([KIDNEY_ML, TUMORS_ML[0]], rel=0.015)
-    with pytest.raises(InputError, match="a tumor by its name"):
+    assert volumes(prepare(paths)) == ml(KIDNEY_ML, TUMORS_ML[0])
+    with pytest.raises(InputError, match="tumor_a"):
         prepare(paths[0])
-    other = replace(phantom, affine=phantom.affine + np.eye(4, k=3))
-    write_nifti(paths[0], phantom.masks["tumor_a"].astype(np.uint8), other.affine, "both")
-    with pytest.raises(InputError, match="another grid"):
+    other = phantom.affine + np.eye(4, k=3)
+    write_nifti(paths[0], phantom.masks["tumor_a"].astype(np.uint8), other, "both")
+    with pytest.raises(InputError, match="tumor_a"):
         prepare(paths)
 
 
@@ -296,23 +304,16 @@ def test_a_size_that_no_kidney_has_is_told(phantom, tmp_path):
     assert kinds(case)["volume"]["ml"] == pytest.approx(8 * KIDNEY_ML, rel=0.015)
 
 
-@pytest.mark.parametrize("off", [2e-8, 5e-4, -5e-4, 2e-3])
-def test_labels_with_a_scale_are_rounded_within_a_thousandth(phantom, tmp_path, off):
+@pytest.mark.parametrize(("off", "fits"), [(2e-8, True), (-3e-4, True), (2e-3, False)])
+def test_labels_with_a_scale_are_rounded_within_a_thousandth(phantom, tmp_path, off, fits):
     array = phantom.map() * np.float64(1 + off)
     write_nifti(tmp_path / "l.nii.gz", array.astype(np.float32), phantom.affine, "both")
-    if 3 * abs(off) > 1e-3:
-        with pytest.raises(InputError):
-            prepare(tmp_path / "l.nii.gz", PrepareOptions(labels=True))
-    else:
-        case = prepare(tmp_path / "l.nii.gz")
-        assert volumes(case) == pytest.approx([KIDNEY_ML, *TUMORS_ML], rel=0.015)
+    with nullcontext() if fits else pytest.raises(InputError):
+        case = prepare(tmp_path / "l.nii.gz", PrepareOptions(labels=True))
+        assert volumes(case) == ml(KIDNEY_ML, *TUMORS_ML)
 
 
 def test_a_shear_that_a_quaternion_cannot_hold_is_no_contradiction(phantom, tmp_path):
-    import nibabel
-
-    from tumortrack.core.geometry import RAS_FROM_LPS
-
     affine = RAS_FROM_LPS @ phantom.affine
     affine[1, 2] += 0.5  # a gantry tilted by 17 degrees
     image = nibabel.Nifti1Image(phantom.map(), affine)
@@ -323,7 +324,7 @@ def test_a_shear_that_a_quaternion_cannot_hold_is_no_contradiction(phantom, tmp_
     assert np.allclose(read_raw(tmp_path / "l.nii.gz").lps_from_index, RAS_FROM_LPS @ affine)
     image.set_qform(affine @ np.diag([-1.0, 1, 1, 1]), code=1)
     nibabel.save(image, tmp_path / "l.nii.gz")
-    with pytest.raises(InputError, match="disagree"):
+    with pytest.raises(InputError, match="sform"):
         read_raw(tmp_path / "l.nii.gz")
 
 
@@ -331,35 +332,34 @@ def test_a_shear_that_a_quaternion_cannot_hold_is_no_contradiction(phantom, tmp_
 def test_a_format_that_is_not_read_says_what_to_save_instead(tmp_path, name):
     (tmp_path / name).write_bytes(b"x" * 100)
     for given in (tmp_path, tmp_path / name):
-        with pytest.raises(InputError, match="Save it as"):
+        with pytest.raises(InputError, match=name):
             prepare(given)
 
 
 def test_a_ct_beside_a_label_map_is_kept_if_it_has_its_grid(phantom, tmp_path):
-    path = nifti(phantom, tmp_path)
-    hu = np.choose(phantom.map(), [-1000, 40, 570, 570]).astype(np.int16)
-    write_nifti(tmp_path / "ct.nii.gz", np.pad(hu, 3), _moved(phantom.affine, -3), "both")
-    case = prepare(path, PrepareOptions(ct=tmp_path / "ct.nii.gz"))
+    path, ct = nifti(phantom, tmp_path), tmp_path / "ct.nii.gz"
+    write_nifti(ct, np.pad(phantom.hu(), 3), moved(phantom.affine, -3), "both")
+    case = prepare(path, PrepareOptions(ct=ct))
     assert (case.ct.hu[case.labels.labels == 2] == 570).all()
-    write_nifti(tmp_path / "ct.nii.gz", hu, _moved(phantom.affine, 0.4), "both")
+    write_nifti(ct, phantom.hu(), moved(phantom.affine, 0.4), "both")
     with pytest.raises(InputError, match="--ct"):
-        prepare(path, PrepareOptions(ct=tmp_path / "ct.nii.gz"))
+        prepare(path, PrepareOptions(ct=ct))
 
 
-def _moved(affine: np.ndarray, voxels: float) -> np.ndarray:
-    out = affine.copy()
-    out[:3, 3] += affine[:3, :3] @ ([voxels] * 3)
-    return out
-
-
-def slices(phantom: Scene, folder: Path) -> tuple[list[Path], np.ndarray]:
-    hu = np.choose(phantom.map(), [-1000, 40, 570, 570]).astype(np.int16)
-    return write_dicom(folder, hu, phantom.affine), hu
+@pytest.mark.parametrize("flipped", [[1], [0, 1], [2]])
+def test_a_ct_stored_turned_to_its_labels_is_theirs(phantom, tmp_path, flipped):
+    labels, turned = phantom.map(), phantom.affine.copy()
+    for axis in flipped:
+        turned[:3, 3] += turned[:3, axis] * (labels.shape[axis] - 1)
+        turned[:3, axis] *= -1
+    write_nifti(tmp_path / "map.nii.gz", np.flip(labels, flipped), turned, "both")
+    write_nifti(tmp_path / "ct.nii.gz", phantom.hu(), phantom.affine, "both")
+    case = prepare(tmp_path / "map.nii.gz", PrepareOptions(ct=tmp_path / "ct.nii.gz"))
+    assert (case.ct.hu[case.labels.labels >= 2] == 570).all()
+    assert (case.ct.hu[case.labels.labels == 1] == 40).all()
 
 
 def retagged(paths: list[Path], **change) -> None:
-    import pydicom
-
     for n, path in enumerate(paths):
         data = pydicom.dcmread(path)
         for tag, of in change.items():
@@ -383,128 +383,105 @@ def late_decimals(by: float):
     ],
 )
 def test_slices_may_differ_by_what_rounding_leaves(phantom, tmp_path, change, read):
-    paths, hu = slices(phantom, tmp_path / "ct")
+    paths = write_dicom(tmp_path / "ct", phantom.hu(), phantom.affine)
     retagged(paths, **change)
-    if read:
+    with nullcontext() if read else pytest.raises(InputError):
         raw = read_raw(tmp_path / "ct")
         assert raw.notes == ()
-        assert np.abs(raw.array - hu).max() < 0.1
-    else:
-        with pytest.raises(InputError):
-            read_raw(tmp_path / "ct")
+        assert np.abs(raw.array - phantom.hu()).max() < 0.1
 
 
 def test_slices_without_a_preamble_and_with_names_of_no_encoding_are_read(phantom, tmp_path):
-    paths, hu = slices(phantom, tmp_path / "ct")
+    paths = write_dicom(tmp_path / "ct", phantom.hu(), phantom.affine)
     for n, path in enumerate(paths):
         content = path.read_bytes()[132:]
         path.unlink()
         (tmp_path / "ct" / os.fsdecode(b"sch\xf6n%d" % n)).write_bytes(content)
     raw = read_raw(tmp_path / "ct")
     assert raw.notes == ()
-    assert np.array_equal(raw.array, hu)
+    assert np.array_equal(raw.array, phantom.hu())
 
 
 def test_a_multi_frame_ct_is_read_from_its_folder_or_itself(phantom, tmp_path):
-    import pydicom
-    from pydicom.dataset import Dataset
-
-    paths, hu = slices(phantom, tmp_path / "classic")
-    data = [pydicom.dcmread(path) for path in paths]
-    whole = pydicom.dcmread(paths[0])
-    whole.SOPClassUID = whole.file_meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.1.1.2.1"
-    whole.NumberOfFrames = len(data)
-    shared, own = Dataset(), []
-    groups = {
-        "PixelMeasuresSequence": ("PixelSpacing",),
-        "PlaneOrientationSequence": ("ImageOrientationPatient",),
-        "PixelValueTransformationSequence": ("RescaleSlope", "RescaleIntercept"),
-    }
-    for name, tags in groups.items():
-        item = Dataset()
-        for tag in tags:
-            setattr(item, tag, getattr(whole, tag))
-            delattr(whole, tag)
-        setattr(shared, name, [item])
-    for slice_ in data[::-1]:
-        item, place = Dataset(), Dataset()
-        place.ImagePositionPatient = slice_.ImagePositionPatient
-        item.PlanePositionSequence = [place]
-        own.append(item)
-    del whole.ImagePositionPatient
-    whole.SharedFunctionalGroupsSequence, whole.PerFrameFunctionalGroupsSequence = [shared], own
-    whole.PixelData = b"".join(slice_.PixelData for slice_ in data[::-1])
+    legacy = pytest.importorskip("highdicom").legacy
+    volume = Volume(phantom.hu().astype(np.float32), phantom.affine)
+    write_dicom_series(volume, tmp_path / "classic")  # in shuffled files
+    data = [pydicom.dcmread(path) for path in (tmp_path / "classic").iterdir()]
+    whole = legacy.LegacyConvertedEnhancedCTImage(data, "1.2.3", 1, "1.2.4", 1)
     (tmp_path / "enhanced").mkdir()
     whole.save_as(tmp_path / "enhanced" / "ct.dcm")
     for given in (tmp_path / "enhanced", tmp_path / "enhanced" / "ct.dcm"):
         raw = read_raw(given)
-        assert np.array_equal(raw.array, hu)
+        assert np.array_equal(raw.array, phantom.hu())
         assert np.allclose(raw.lps_from_index, phantom.affine, atol=1e-4)
 
 
-def test_our_own_dicom_segmentation_is_read_as_it_was_written(phantom, tmp_path):
+def segmentation(scene: Scene, folder: Path) -> Path:
+    """Of a CT beside it, by highdicom."""
     pytest.importorskip("highdicom")
-    from tumortrack.imaging.segmentation_files import segments, write_dicom_seg
-    from tumortrack.phantom.dicom import write_dicom_series
+    labels = LabelVolume(scene.map(), scene.affine)
+    if not (folder / "ct").exists():
+        write_dicom_series(Volume(scene.hu().astype(np.float32), scene.affine), folder / "ct")
+    parts = segments(NAMES[: int(labels.labels.max())])
+    write_dicom_seg(folder / "segmentation.dcm", labels, parts, folder / "ct")
+    return folder / "segmentation.dcm"
 
-    hu = np.choose(phantom.map(), [-1000, 40, 570, 570]).astype(np.float32)
-    write_dicom_series(Volume(hu, phantom.affine), tmp_path / "ct")
-    labels = LabelVolume(phantom.map(), phantom.affine)
-    path = tmp_path / "segmentation.dcm"
-    write_dicom_seg(path, labels, segments(("kidney", "tumor_1", "tumor_2")), tmp_path / "ct")
-    case = prepare(path)
-    assert volumes(case) == pytest.approx([KIDNEY_ML, *TUMORS_ML], rel=0.015)
-    raw = read_raw(path)
-    first = int(np.flatnonzero(labels.labels.any((0, 1)))[0]) - 1  # an empty slice at either end
+
+def test_our_own_dicom_segmentation_is_read_as_it_was_written(phantom, tmp_path):
+    path, labels = segmentation(phantom, tmp_path), phantom.map()
+    case, raw = prepare(path), read_raw(path)
+    assert volumes(case) == ml(KIDNEY_ML, *TUMORS_ML)
+    first = int(np.flatnonzero(labels.any((0, 1)))[0]) - 1  # an empty slice at either end
     stop = first + raw.array.shape[2]
-    assert np.array_equal(raw.array, labels.labels[..., first:stop])
-    assert not labels.labels[..., stop:].any()
+    assert np.array_equal(raw.array, labels[..., first:stop])
+    assert not labels[..., stop:].any()
     assert not case.warnings
     assert raw.notes[0] in case.report["notes"]  # where the CT ends, the file does not say
 
 
 def test_a_dicom_segmentation_is_cut_where_its_ct_ends(phantom, tmp_path):
-    pytest.importorskip("highdicom")
-    from tumortrack.imaging.segmentation_files import segments, write_dicom_seg
-    from tumortrack.phantom.dicom import write_dicom_series
+    middle = phantom.map().shape[2] // 2
+    half = Scene({k: mask[..., :middle] for k, mask in phantom.masks.items()}, phantom.affine)
+    path = segmentation(half, tmp_path)
+    assert "cut" not in kinds(prepare(path))
+    assert list(kinds(prepare(path, PrepareOptions(ct=tmp_path / "ct")))) == ["flat", "cut"]
 
-    half = phantom.map()[..., : phantom.map().shape[2] // 2]
-    hu = np.choose(half, [-1000, 40, 570, 570]).astype(np.float32)
-    write_dicom_series(Volume(hu, phantom.affine), tmp_path / "ct")
-    labels, path = LabelVolume(half, phantom.affine), tmp_path / "segmentation.dcm"
-    parts = ("kidney", "tumor_1", "tumor_2")[: int(half.max())]
-    write_dicom_seg(path, labels, segments(parts), tmp_path / "ct")
-    assert "cut" not in [warning.kind for warning in prepare(path).warnings]
-    case = prepare(path, PrepareOptions(ct=tmp_path / "ct"))
-    assert [warning.kind for warning in case.warnings] == ["flat", "cut"]
+
+def test_a_segmentation_of_a_tilted_gantry_lies_where_its_labels_lie(phantom, tmp_path):
+    tilted = replace(phantom, affine=phantom.affine + 0.7 * np.eye(4, k=1) * [[0], [1], [0], [0]])
+    paths = write_dicom(tmp_path / "ct", tilted.hu(), tilted.affine)
+    needed = ["PatientName", "PatientBirthDate", "PatientSex", "StudyID", "StudyDate", "StudyTime"]
+    needed += ["AccessionNumber", "ReferringPhysicianName", "PatientID"]
+    tags = dict.fromkeys(needed, lambda *_: "")
+    tags |= {"FrameOfReferenceUID": lambda *_: "1.2.7", "InstanceNumber": lambda n, _: n + 1}
+    retagged(paths, **tags, SliceThickness=lambda *_: VOXEL_MM)
+    told, read = (prepare(write(tilted, tmp_path)).anatomy for write in (nifti, segmentation))
+    for part, same in zip(told.parts, read.parts, strict=True):
+        assert np.abs(part.box_mm - same.box_mm).max() < 0.1
 
 
 def test_an_organ_cut_flat_within_its_image_is_told(phantom, tmp_path):
     """One empty slice behind the cut, or a crop to a box, and the border says nothing."""
     labels = phantom.map()
     labels[..., labels.shape[2] // 2 :] = 0
-    half = Scene(
-        {"kidney": labels > 0, "tumor_b": labels == phantom.number("tumor_b")}, phantom.affine
-    )
+    half = phantom.of(kidney=labels > 0)
     assert kinds(prepare(nifti(half, tmp_path)))["flat"]["area_cm2"] > 10
-    assert "flat" in kinds(prepare(meshes(replace(half, masks={"kidney": labels > 0}), tmp_path)))
+    assert "flat" in kinds(prepare(meshes(half, tmp_path)))
 
 
 @numbered
 @pytest.mark.parametrize("kept", [(1, 0), (1, 0, 0), (1,) * 30 + (0,)])
 def test_an_organ_drawn_in_some_slices_alone_is_refused(phantom, tmp_path, write, kept):
-    masks = {name: mask.copy() for name, mask in phantom.masks.items()}
-    for mask in masks.values():
-        mask &= np.resize(kept, mask.shape[2]).astype(bool)
+    drawn = np.resize(kept, phantom.map().shape[2]).astype(bool)
+    masks = {name: mask & drawn for name, mask in phantom.masks.items()}
     with pytest.raises(InputError, match="slices"):
-        prepare(write(replace(phantom, masks=masks), tmp_path))
+        prepare(write(phantom.of(**masks), tmp_path))
 
 
 def test_a_slice_that_is_all_tumor_is_no_empty_one(phantom, tmp_path):
     kidney = phantom.masks["kidney"]
-    tumor = np.zeros_like(kidney)
-    tumor[..., kidney.shape[2] // 2] = kidney[..., kidney.shape[2] // 2]
-    case = prepare(nifti(replace(phantom, masks={"kidney": kidney, "tumor": tumor}), tmp_path))
+    tumor = kidney & (np.arange(kidney.shape[2]) == kidney.shape[2] // 2)
+    case = prepare(nifti(phantom.of("kidney", tumor=tumor), tmp_path))
     assert volumes(case)[0] == pytest.approx(KIDNEY_ML, rel=0.03)
 
 
@@ -512,9 +489,7 @@ def test_a_label_that_no_segment_describes_is_refused_and_none_is_overlooked(pha
     path = seg_nrrd(phantom, tmp_path)
     text = path.read_bytes()
     path.write_bytes(text.replace(b"Segment1_", b"Segment7_"))  # numbers need not be whole
-    assert sorted(volumes(prepare(path))) == pytest.approx(
-        sorted([KIDNEY_ML, *TUMORS_ML]), rel=0.03
-    )
+    assert sorted(volumes(prepare(path))) == ml(*sorted([KIDNEY_ML, *TUMORS_ML]), rel=0.03)
     start = text.index(b"Segment1_")
     path.write_bytes(text[:start] + text[text.index(b"Segment2_") :])
     with pytest.raises(InputError, match="label 1"):
@@ -528,17 +503,15 @@ def test_what_lies_in_something_else_that_nobody_uses_is_not_asked_for(phantom, 
     other[:3, :3, :3] = True
     masks = {"body": body & ~phantom.masks["kidney"], **phantom.masks, "other": other}
     case = prepare(write(replace(phantom, masks=masks), tmp_path))
-    assert volumes(case) == pytest.approx([KIDNEY_ML, *TUMORS_ML], rel=0.03)
+    assert volumes(case) == ml(KIDNEY_ML, *TUMORS_ML, rel=0.03)
 
 
 @named
 def test_what_lies_in_the_organ_under_an_unknown_name_is_asked_for(phantom, tmp_path, write):
-    masks = {"kidney": phantom.masks["kidney"], "thing": phantom.masks["tumor_a"]}
-    path = write(replace(phantom, masks=masks), tmp_path)
-    number = 1 if write is files and "kidney" > "thing" else 2
+    path = write(phantom.of("kidney", thing=phantom.masks["tumor_a"]), tmp_path)
     with pytest.raises(InputError, match="thing"):
         prepare(path)
-    case = prepare(path, PrepareOptions(tumor=number))
+    case = prepare(path, PrepareOptions(tumor=2))
     assert volumes(case)[1] == pytest.approx(TUMORS_ML[0], rel=0.03)
 
 
@@ -559,24 +532,20 @@ def test_what_names_say(name, organ, tumor):
 
 
 def test_a_solid_within_a_solid_is_refused_and_a_cavity_is_not(tmp_path):
-    import trimesh
-
     outer, inner = trimesh.creation.icosphere(3, 30.0), trimesh.creation.icosphere(3, 10.0)
     trimesh.util.concatenate([outer, inner]).export(tmp_path / "kidney.stl")
-    with pytest.raises(InputError, match="within another"):
+    with pytest.raises(InputError, match="kidney"):
         prepare(tmp_path / "kidney.stl")
     inner.invert()
     trimesh.util.concatenate([outer, inner]).export(tmp_path / "kidney.stl")
-    assert volumes(prepare(tmp_path / "kidney.stl")) == pytest.approx(
-        [outer.volume / 1000], rel=0.01
-    )
+    assert volumes(prepare(tmp_path / "kidney.stl")) == ml(outer.volume / 1000)
 
 
 def test_meshes_beside_label_files_and_too_many_of_these_are_refused(phantom, tmp_path):
     folder = files(phantom, tmp_path)
     (folder / "tumor_b.nii.gz").rename(folder / "tumor_b.nii")
     (folder / "tumor.stl").write_bytes(b"")
-    with pytest.raises(InputError, match="beside meshes"):
+    with pytest.raises(InputError, match="tumor_b"):
         prepare(folder)
     with pytest.raises(InputError, match="255"):
         read_several([tmp_path / f"{n}.nii" for n in range(256)])
@@ -586,76 +555,27 @@ def test_a_folder_of_masks_may_hold_other_files(phantom, tmp_path):
     folder = files(phantom, tmp_path)
     (folder / "statistics.json").write_text("{}")
     case = prepare(folder)
-    assert volumes(case) == pytest.approx([KIDNEY_ML, *TUMORS_ML], rel=0.03)
+    assert volumes(case) == ml(KIDNEY_ML, *TUMORS_ML, rel=0.03)
     assert any("statistics.json" in note for note in case.report["notes"])
-
-
-@named
-def test_a_side_that_the_names_deny_is_refused(phantom, tmp_path, write):
-    masks = {"kidney_right": phantom.masks["kidney"], "tumor": phantom.masks["tumor_a"]}
-    path = write(replace(phantom, masks=masks), tmp_path)
-    with pytest.raises(InputError, match="--side"):
-        prepare(path, PrepareOptions(side="left"))
-
-
-@pytest.mark.parametrize("flipped", [[1], [0, 1], [2]])
-def test_a_ct_stored_turned_to_its_labels_is_theirs(phantom, tmp_path, flipped):
-    labels, turned = phantom.map(), phantom.affine.copy()
-    for axis in flipped:
-        turned[:3, 3] += turned[:3, axis] * (labels.shape[axis] - 1)
-        turned[:3, axis] *= -1
-    write_nifti(tmp_path / "map.nii.gz", np.flip(labels, flipped), turned, "both")
-    hu = np.choose(labels, [-1000, 40, 570, 570]).astype(np.int16)
-    write_nifti(tmp_path / "ct.nii.gz", hu, phantom.affine, "both")
-    case = prepare(tmp_path / "map.nii.gz", PrepareOptions(ct=tmp_path / "ct.nii.gz"))
-    assert (case.ct.hu[case.labels.labels >= 2] == 570).all()
-    assert (case.ct.hu[case.labels.labels == 1] == 40).all()
 
 
 def test_stated_labels_are_of_a_label_map_however_many_it_has(phantom, tmp_path):
     labels = phantom.map()
     labels[0, 0, :60] = np.arange(60) + 100
-    many = replace(phantom, masks={"all": labels > 0})
-    write_nifti(tmp_path / "map.nii.gz", labels, many.affine, "both")
+    write_nifti(tmp_path / "map.nii.gz", labels, phantom.affine, "both")
     case = prepare(tmp_path / "map.nii.gz", PrepareOptions(organ=1, tumor=(2, 3)))
-    assert volumes(case) == pytest.approx([KIDNEY_ML, *TUMORS_ML], rel=0.03)
-
-
-def test_a_segmentation_of_a_tilted_gantry_lies_where_its_labels_lie(phantom, tmp_path):
-    pytest.importorskip("highdicom")
-    from tumortrack.imaging.segmentation_files import segments, write_dicom_seg
-
-    affine = phantom.affine.copy()
-    affine[1, 2] += 0.7
-    labels = LabelVolume(phantom.map(), affine)
-    paths = write_dicom(tmp_path / "ct", np.zeros(labels.labels.shape, np.int16), affine)
-    needed = "PatientName", "PatientBirthDate", "PatientSex", "StudyID", "StudyDate", "StudyTime"
-    needed += "AccessionNumber", "ReferringPhysicianName", "PatientID"
-    tags = dict.fromkeys(needed, lambda *_: "")
-    tags |= {"FrameOfReferenceUID": lambda *_: "1.2.7", "InstanceNumber": lambda n, _: n + 1}
-    retagged(paths, **tags, SliceThickness=lambda *_: VOXEL_MM)
-    path = tmp_path / "segmentation.dcm"
-    write_dicom_seg(path, labels, segments(("kidney", "tumor_1", "tumor_2")), tmp_path / "ct")
-    told = prepare(nifti(replace(phantom, affine=affine), tmp_path)).anatomy
-    for part, same in zip(told.parts, prepare(path).anatomy.parts, strict=True):
-        assert np.abs(part.box_mm - same.box_mm).max() < 0.1
-
-
-@pytest.mark.usefixtures("unchecked")
-def test_labels_that_are_no_numbers_are_refused():
-    with pytest.raises(InputError, match="whole numbers"):
-        PrepareOptions(organ="1")
+    assert volumes(case) == ml(KIDNEY_ML, *TUMORS_ML, rel=0.03)
 
 
 def test_a_slice_that_is_there_twice_is_read_once(phantom, tmp_path):
-    paths, hu = slices(phantom, tmp_path / "ct")
-    (tmp_path / "ct" / "copy").write_bytes(paths[5].read_bytes())
-    raw = read_raw(tmp_path / "ct")
-    assert np.array_equal(raw.array, hu)
-    assert any("twice" in note for note in raw.notes)
-    paths, hu = slices(phantom, tmp_path / "anonymous")
+    paths = write_dicom(tmp_path, phantom.hu(), phantom.affine)
+    (tmp_path / "copy").write_bytes(paths[5].read_bytes())
+    raw = read_raw(tmp_path)
+    assert np.array_equal(raw.array, phantom.hu())
+    assert len(raw.notes) == 1
+    (tmp_path / "copy").unlink()
     retagged(paths, SOPInstanceUID=lambda *_: "1.2.3")  # of all
-    assert np.array_equal(read_raw(tmp_path / "anonymous").array, hu)
+    assert np.array_equal(read_raw(tmp_path).array, phantom.hu())
 
 
 def test_another_organ_by_its_files_name_is_asked_for(phantom, tmp_path):

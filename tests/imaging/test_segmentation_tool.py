@@ -15,6 +15,8 @@ from imaging_objects import kidney_labels
 from tumortrack import api
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import LabelVolume
+from tumortrack.imaging.case import Case
+from tumortrack.imaging.grid import voxel_ml
 from tumortrack.imaging.nifti import write_volume_nifti
 from tumortrack.imaging.options import PrepareOptions
 from tumortrack.imaging.segmentation_tool import segmented_case
@@ -65,94 +67,10 @@ def totalsegmentator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return weights
 
 
-def test_a_tool_segments_and_is_named(
-    scanned: tuple[Path, LabelVolume], totalsegmentator: Path, tmp_path: Path, capfd
-) -> None:
-    ct, truth = scanned
-    keep, asked = tmp_path / "case.labels.nii.gz", PrepareOptions(name="liver", patient="P1")
-    case = segmented_case(ct, "totalsegmentator:liver_lesions", asked, keep)
-    assert capfd.readouterr().out.split("\n")[:2] == [
-        "Predicting... total", "Predicting... liver_lesions",
-    ]  # fmt: skip
-    assert case.anatomy.names == ("liver", "tumor_1", "tumor_2")
-    assert case.patient.id == "P1"
-    counts, wanted = (np.bincount(v.ravel())[1:] for v in (case.labels.labels, truth.labels))
-    assert sorted(counts.tolist()) == sorted(wanted.tolist())
-    assert case.ct is not None  # as where HU windows segment it
-    assert set(np.unique(case.ct.hu[case.labels.labels > 1])) == {400.0}
-    kept = read_labels(keep)  # on the CT's voxels, in our numbers
-    np.testing.assert_array_equal(kept.labels, np.minimum(truth.labels, 2))
-    np.testing.assert_allclose(kept.lps_from_index, truth.lps_from_index, atol=1e-4)
-    about = case.report["segmentation"]
-    assert about["label_map"] == keep.name
-    assert len(about["weights_sha256"]) == 7
-    assert about["commands"][1].endswith("-o out/lesions --task liver_lesions")
-    assert any("check it in qc.png" in note for note in case.report["notes"])
-    with pytest.raises(InputError, match=r"case\.labels\.nii\.gz exists already"):
-        api.prepare(ct, tmp_path / "case", segment="totalsegmentator", name="liver")
-
-
-def test_what_lacks_is_named_with_what_to_do(
-    scanned: tuple[Path, LabelVolume], totalsegmentator: Path, tmp_path: Path, monkeypatch
-) -> None:
-    ct, _ = scanned
-
-    def refused(spec: str, word: str, name: str = "liver") -> None:
-        with pytest.raises(InputError, match=word):
-            segmented_case(ct, spec, PrepareOptions(name=name), tmp_path / "new.nii.gz")
-        assert not (tmp_path / "new.nii.gz").exists()
-
-    refused("totalsegmentator:liver_vessels", "totalseg_download_weights -t liver_vessels")
-    refused("totalsegmentator:face", "tasks are liver_lesions")
-    refused("otsu", "is not known: totalsegmentator")
-    refused("monai:", "is not known")
-    program = tmp_path / "bin" / "TotalSegmentator"
-    program.write_text(f"#!{sys.executable}\nimport sys\nprint('no GPU')\nsys.exit(3)\n")
-    refused("totalsegmentator", "ended with code 3")
-    program.write_text(f"#!{sys.executable}\n")  # another version, say
-    refused("totalsegmentator", "wrote no liver.nii.gz")
-    program.unlink()
-    refused("totalsegmentator", "pip install TotalSegmentator")
-    with pytest.raises(InputError, match="--organ means nothing"):
-        segmented_case(ct, "totalsegmentator", PrepareOptions(organ=5), tmp_path / "new.nii.gz")
-    with pytest.raises(InputError, match="needs a folder"):
-        api.prepare(ct, segment="totalsegmentator")
-
-
-def test_an_nnunet_folder_is_checked_before_it_runs(
-    scanned: tuple[Path, LabelVolume], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ct, _ = scanned
-    program = tmp_path / "bin" / "nnUNetv2_predict_from_modelfolder"
-    program.parent.mkdir()
-    model = tmp_path / "model"
-    model.mkdir()
-
-    def refused(word: str) -> None:
-        with pytest.raises(InputError, match=word):
-            segmented_case(ct, f"nnunet:{model}", PrepareOptions(), tmp_path / "new.nii.gz")
-
-    monkeypatch.setenv("PATH", str(program.parent))
-    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))  # nothing beside it
-    refused("pip install nnunetv2")
-    program.write_text("#!/bin/false\n")
-    program.chmod(0o755)
-    refused("there is no .*dataset.json")
-    about = {"channel_names": {"0": "CT"}, "file_ending": ".nii.gz", "labels": {"liver": 1}}
-    (model / "dataset.json").write_text(json.dumps(about))
-    refused("lacks plans.json or fold_N")
-    (model / "plans.json").write_text("{}")
-    (model / "fold_0").mkdir()
-    (model / "fold_0" / "checkpoint_final.pth").write_text("")
-    refused("knows liver, and no kidney")
-    (model / "dataset.json").write_text(json.dumps(about | {"channel_names": {"0": "a", "1": "b"}}))
-    refused("one CT")
-
-
-def test_names_are_understood_as_published_models_write_them(
-    scanned: tuple[Path, LabelVolume], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    ct, truth = scanned
+@pytest.fixture
+def nnunet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A program of that name on the PATH, which tells HU apart, and the folder of a model whose
+    labels are named as published ones are."""
     program, model = tmp_path / "bin" / "nnUNetv2_predict_from_modelfolder", tmp_path / "model"
     program.parent.mkdir()
     program.write_text(f"""#!{sys.executable}
@@ -169,11 +87,92 @@ nibabel.save(nibabel.Nifti1Image(labels, ct.affine), "out/ct.nii.gz")
     labels = {"background": 0, "Spleen": 1, "Right Kidney": 3, "renal-Neoplasm": 7}
     about = {"channel_names": {"0": "CT"}, "file_ending": ".nii.gz", "labels": labels}
     (model / "dataset.json").write_text(json.dumps(about))
+    return model
+
+
+def same_counts(case: Case, truth: LabelVolume) -> bool:
+    counts = (np.bincount(v.labels.ravel())[1:] for v in (case.labels, truth))
+    return len({tuple(sorted(each.tolist())) for each in counts}) == 1
+
+
+def test_a_tool_segments_and_is_named(scanned, totalsegmentator, tmp_path, capfd):
+    ct, truth = scanned
+    keep, asked = tmp_path / "case.labels.nii.gz", PrepareOptions(name="liver", patient="P1")
+    case = segmented_case(ct, "totalsegmentator:liver_lesions", asked, keep)
+    assert capfd.readouterr().out.split("\n")[:2] == [
+        "Predicting... total", "Predicting... liver_lesions",
+    ]  # fmt: skip
+    assert case.anatomy.names == ("liver", "tumor_1", "tumor_2")
+    assert case.patient.id == "P1"
+    assert same_counts(case, truth)
+    assert set(np.unique(case.ct.hu[case.labels.labels > 1])) == {400.0}
+    kept = read_labels(keep)  # on the CT's voxels, in our numbers
+    np.testing.assert_array_equal(kept.labels, np.minimum(truth.labels, 2))
+    np.testing.assert_allclose(kept.lps_from_index, truth.lps_from_index, atol=1e-4)
+    about = case.report["segmentation"]
+    assert (about["label_map"], len(about["weights_sha256"])) == (keep.name, 7)
+    assert about["commands"][1].endswith("-o out/lesions --task liver_lesions")
+    assert any("qc.png" in note for note in case.report["notes"])
+    with pytest.raises(InputError, match=r"case\.labels\.nii\.gz"):
+        api.prepare(ct, tmp_path / "case", segment="totalsegmentator", name="liver")
+    with pytest.raises(InputError):  # where would the map go?
+        api.prepare(ct, segment="totalsegmentator")
+
+
+def refused(ct: Path, spec: str, word: str, **options) -> None:
+    keep = ct.parent / "new.nii.gz"
+    with pytest.raises(InputError, match=word):
+        segmented_case(ct, spec, PrepareOptions(**options), keep)
+    assert not keep.exists()
+
+
+@pytest.mark.parametrize(
+    ("spec", "word"),
+    [
+        ("totalsegmentator:liver_vessels", "totalseg_download_weights -t liver_vessels"),
+        ("totalsegmentator:face", "face"),
+        ("otsu", "otsu"),
+        ("monai:", "monai"),
+    ],
+)
+def test_an_unknown_tool_and_weights_that_lack_are_named(scanned, totalsegmentator, spec, word):
+    refused(scanned[0], spec, word, name="liver")
+
+
+def test_a_tool_that_fails_is_named_with_what_to_do(scanned, totalsegmentator, tmp_path):
+    (ct, _), program = scanned, tmp_path / "bin" / "TotalSegmentator"
+    refused(ct, "totalsegmentator", "--organ", organ=5)
+    program.write_text(f"#!{sys.executable}\nimport sys\nprint('no GPU')\nsys.exit(3)\n")
+    refused(ct, "totalsegmentator", "code 3", name="liver")
+    program.write_text(f"#!{sys.executable}\n")  # another version, say
+    refused(ct, "totalsegmentator", r"no liver\.nii\.gz", name="liver")
+    program.unlink()
+    refused(ct, "totalsegmentator", "pip install TotalSegmentator", name="liver")
+
+
+def test_an_nnunet_folder_is_checked_before_it_runs(scanned, nnunet, tmp_path, monkeypatch):
+    (ct, _), spec, dataset = scanned, f"nnunet:{nnunet}", nnunet / "dataset.json"
+    about = json.loads(dataset.read_text())
+    for change, word in (
+        ({"labels": {"liver": 1}}, "kidney"), ({"channel_names": {"0": "a", "1": "b"}}, "one CT"),
+    ):  # fmt: skip
+        dataset.write_text(json.dumps(about | change))
+        refused(ct, spec, word)
+    (nnunet / "plans.json").unlink()
+    refused(ct, spec, r"plans\.json")
+    dataset.unlink()
+    refused(ct, spec, r"dataset\.json")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))  # nothing beside it
+    refused(ct, spec, "pip install nnunetv2")
+
+
+def test_names_are_understood_as_published_models_write_them(scanned, nnunet, tmp_path):
+    ct, truth = scanned
     options = PrepareOptions(side="right")
-    case = segmented_case(ct, f"nnunet:{model}", options, tmp_path / "new.nii.gz")
+    case = segmented_case(ct, f"nnunet:{nnunet}", options, tmp_path / "new.nii.gz")
     assert case.anatomy.names == ("kidney", "tumor_1", "tumor_2")
-    counts, wanted = (np.bincount(v.ravel())[1:] for v in (case.labels.labels, truth.labels))
-    assert sorted(counts.tolist()) == sorted(wanted.tolist())
+    assert same_counts(case, truth)
 
 
 def test_nnunet_runs_end_to_end(scanned: tuple[Path, LabelVolume], tmp_path: Path) -> None:
@@ -186,8 +185,7 @@ def test_nnunet_runs_end_to_end(scanned: tuple[Path, LabelVolume], tmp_path: Pat
     case = api.prepare(ct, tmp_path / "case", segment=f"nnunet:{model}")
     assert case.anatomy.names == ("kidney", "tumor_1", "tumor_2")
     volumes = case.report["volumes_ml"]
-    voxel_ml = np.linalg.det(truth.lps_from_index[:3, :3]).__abs__() / 1000
-    counts = np.bincount(truth.labels.ravel()) * voxel_ml
+    counts = np.bincount(truth.labels.ravel()) * voxel_ml(truth.lps_from_index)
     assert volumes["kidney"] == pytest.approx(counts[1:].sum(), rel=0.02)
     assert volumes["tumor_1"] == pytest.approx(counts[2:].max(), rel=0.1)
     assert case.report["segmentation"]["tool"] == "nnU-Net"

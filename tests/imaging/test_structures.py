@@ -5,13 +5,13 @@ import pytest
 
 from organ_objects import liver
 from tumortrack.core.errors import InputError
-from tumortrack.core.mesh_files import read_mesh, write_mesh
+from tumortrack.core.mesh_files import write_mesh
 from tumortrack.core.types import LabelVolume, Mesh
 from tumortrack.imaging.case import load_case, save_case
 from tumortrack.imaging.nifti import write_nifti
 from tumortrack.imaging.options import PrepareOptions, parse_structures
 from tumortrack.imaging.prepare import prepare
-from tumortrack.imaging.structures import TRUSTED_MM, split_structures
+from tumortrack.imaging.structures import split_structures
 
 VESSEL = 4
 
@@ -21,8 +21,7 @@ def with_vessel(voxel_mm=3.0) -> LabelVolume:
     volume = liver((((-50, -20, 10), 15.0),), voxel_mm)
     labels = volume.labels.copy()
     index = np.indices(labels.shape).reshape(3, -1).T
-    x, _, z = (index * voxel_mm + volume.lps_from_index[:3, 3]).T
-    y = index[:, 1] * voxel_mm + volume.lps_from_index[1, 3]
+    x, y, z = (index * voxel_mm + volume.lps_from_index[:3, 3]).T
     tube = ((x + 10) ** 2 + z**2 < 9.0**2) & (y < 0)
     labels.reshape(-1)[tube] = VESSEL
     return LabelVolume(labels, volume.lps_from_index)
@@ -65,31 +64,17 @@ def test_open_meshes_are_taken_as_they_are(label_map, tmp_path):
     assert len(sheet_read.faces) == 2
     assert sheet_read.box_mm == pytest.approx(sheet.box_mm)
     write_mesh(tmp_path / "far.ply", sheet.moved(sheet.vertices_mm + 500))
-    far = replace(options, structure=(f"cut={tmp_path / 'far.ply'}",))
-    with pytest.raises(InputError, match="from the organ"):
-        prepare(label_map, far)
-    assert len(read_mesh(tmp_path / "far.ply").faces) == 2
+    with pytest.raises(InputError, match="cut"):
+        prepare(label_map, replace(options, structure=(f"cut={tmp_path / 'far.ply'}",)))
 
 
-@pytest.mark.parametrize(
-    ("options", "why"),
-    [
-        (("artery",), "NAME=NUMBER"),
-        (("liver=3",), "taken"),
-        (("a=3", "a=4"), "taken"),
-        (("tumor_1=3",), "can't be the name of a structure"),
-        (("../x=3",), "can't be the name of a structure"),
-    ],
-)
-def test_what_names_no_structure_is_refused(options, why):
-    with pytest.raises(InputError, match=why):
-        parse_structures(options, "liver")
-    assert parse_structures(("a=3", "b=c/d.stl"), "liver")["a"] == 3
+@pytest.mark.parametrize("options", ["artery", "liver=3", "tumor_1=3", "../x=3", "a=3 a=4"])
+def test_what_names_no_structure_is_refused(options):
+    with pytest.raises(InputError, match="structure"):
+        parse_structures(tuple(options.split()), "liver")
 
 
-def test_labels_that_are_not_there_or_the_organs_are_refused():
-    volume = with_vessel(6.0)
-    for number in (1, 9):
-        with pytest.raises(InputError, match="the map's labels are"):
-            split_structures(volume, {"artery": number}, 1)
-    assert TRUSTED_MM == 5.0
+@pytest.mark.parametrize("number", [1, 9])
+def test_labels_that_are_not_there_or_the_organs_are_refused(number):
+    with pytest.raises(InputError, match=f"artery={number}"):
+        split_structures(with_vessel(6.0), {"artery": number}, 1)

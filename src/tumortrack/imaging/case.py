@@ -56,7 +56,7 @@ class Case:
 
 
 class _Manifest(msgspec.Struct):
-    """The fields that only a case's manifest has."""
+    """What only a case's manifest has."""
 
     organ: Organ
     structures: list[str]
@@ -75,8 +75,8 @@ def save_case(case: Case, folder: Path) -> None:
     write_anatomy(folder, case.anatomy)
     for name, mesh in case.anatomy.structures.items():
         write_mesh(folder / f"{name}.ply", mesh)
-    labels = case.labels
-    write_nifti(folder / "labels.nii.gz", labels.labels, labels.lps_from_index, lps=True)
+    labels = case.labels.labels
+    write_nifti(folder / "labels.nii.gz", labels, case.labels.lps_from_index, lps=True)
     if case.ct is not None:
         write_volume_nifti(folder / "ct.nii.gz", case.ct.hu, case.ct.lps_from_index)
     content = {
@@ -101,11 +101,8 @@ def holds_case(folder: Path) -> bool:
 
 
 def load_case(folder: str | Path) -> Case:
-    """Read a folder that ``prepare`` wrote, every file checked against its sha256.
-
-    Raises:
-        ArtifactError: not a case, of another schema, damaged or changed since.
-    """
+    """Read a folder that ``prepare`` wrote, every file checked against its sha256. Raises
+    ArtifactError: not a case, of another schema, damaged or changed since."""
     folder = Path(folder)
     try:
         manifest = msgspec.convert(store.read_manifest(folder, KIND), _Manifest)
@@ -113,10 +110,8 @@ def load_case(folder: str | Path) -> Case:
             check_name(name, "a structure", "--structure")
         warnings = findings_in(manifest.warnings, str(folder))
     except (InputError, msgspec.ValidationError) as error:
-        reason = str(error).rstrip(".")
-        raise ArtifactError(
-            f"{folder} is not a case folder: {reason}. Make one with `tumortrack prepare`."
-        ) from error
+        reason = f"{str(error).rstrip('.')}. Make one with `tumortrack prepare`."
+        raise ArtifactError(f"{folder} is not a case folder: {reason}") from error
     structures = {name: read_mesh(folder / f"{name}.ply") for name in manifest.structures}
     anatomy = replace(read_anatomy(folder, manifest.organ), structures=structures)
     if (names := list(anatomy.names)) != manifest.parts:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -49,6 +50,12 @@ class Plane(NamedTuple):
     def normal(self) -> np.ndarray:
         return np.cross(self.orientation[:3], self.orientation[3:])
 
+    @property
+    def fault(self) -> str:
+        if min(self.spacing_mm) <= 0:
+            return f"PixelSpacing {self.spacing_mm} must be above 0"
+        return f"RescaleSlope {self.scale[0]:g} must be above 0" if self.scale[0] <= 0 else ""
+
     def lps_from_index(self, step_mm: np.ndarray) -> Float[np.ndarray, "4 4"]:
         """Of a stack that begins here; index i runs along a row."""
         row, column = np.reshape(self.orientation, (2, 3))
@@ -59,20 +66,19 @@ class Plane(NamedTuple):
         return out
 
 
-@dataclass(frozen=True)
-class _Slice:
+class _Slice(NamedTuple):
     path: Path
     uid: str
     description: str
     modality: str
-    shape: tuple[int, int]  # rows, columns
-    plane: Plane
-    fault: str  # why its numbers can't be HU; "": nothing
     patient_id: str
     laterality: str  # L, R or something else
-    frame: int  # of its file
     instance: str  # SOPInstanceUID
+    shape: tuple[int, int]  # rows, columns
     classic: bool  # its file has no other frame
+    fault: str  # why its pixels can't be HU; "": nothing
+    plane: Plane
+    frame: int  # of its file
 
 
 class NoSeries(InputError):
@@ -112,7 +118,7 @@ def find_series(folder: Path, series: str | None = None) -> Series:
         raise InputError(f"{first.path}: ImageOrientationPatient is not two unit directions.")
     slices = sorted(different, key=lambda s: float(np.dot(s.plane.position_mm, normal)))
     start = first.plane._replace(position_mm=slices[0].plane.position_mm)
-    lps_from_index = start.lps_from_index(_slice_step(slices, normal))
+    lps_from_index = start.lps_from_index(_slice_step(folder, slices, normal))
     shape = (first.shape[1], first.shape[0], len(slices))
     stored = sum(path.stat().st_size for path in {s.path for s in slices})
     check_size(folder, shape, 4, compressed=True, stored=stored)
@@ -123,14 +129,14 @@ def find_series(folder: Path, series: str | None = None) -> Series:
         notes += (f"{len(others)} images of {kinds} left out ({_named(others)})",)
     if not first.uid:
         notes += ("the slices have no SeriesInstanceUID: taken as one series",)
-    files, frames = tuple(s.path for s in slices), tuple(s.frame for s in slices)
+    files, frames = zip(*((s.path, s.frame) for s in slices), strict=True)
     patient = _patient(folder, groups, slices)
     return Series(files, frames, shape, lps_from_index, first.plane.scale, notes, patient)
 
 
 def _named(names: list[str]) -> str:
     different = list(dict.fromkeys(names))
-    return ", ".join(different[:3]) + (", ..." if len(different) > 3 else "")
+    return ", ".join(different[:3] + ["..."] * (len(different) > 3))
 
 
 def read_dicom(folder: Path, series: str | None = None) -> RawVolume:
@@ -149,8 +155,8 @@ def _patient(folder: Path, groups: list[list[_Slice]], slices: list[_Slice]) -> 
             "folder of one patient alone."
         )
     sides: dict[str, Side] = {"L": "left", "R": "right"}
-    stated = {s.laterality for s in slices}
-    side: Side = sides.get(stated.pop(), UNKNOWN) if len(stated) == 1 else UNKNOWN
+    first, *others = {s.laterality for s in slices}
+    side = UNKNOWN if others else sides.get(first, UNKNOWN)
     return Patient(ids[0] if ids else UNKNOWN, side)
 
 
@@ -161,8 +167,8 @@ def _check_tags(folder: Path, slices: list[_Slice]) -> None:
     if slope > _SAME_SLOPE * abs(scales[0][0]) or intercept > _SAME_HU:
         raise InputError(f"{folder}: its slices differ in RescaleSlope or Intercept. {_AGAIN}")
     for s in slices:
-        if s.fault:
-            raise InputError(f"{s.path}: {s.fault}. {_AGAIN}")
+        if fault := s.plane.fault or s.fault:
+            raise InputError(f"{s.path}: {fault}. {_AGAIN}")
 
 
 def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
@@ -197,13 +203,13 @@ def _groups(folder: Path) -> tuple[list[list[_Slice]], tuple[str, ...]]:
         for file in left_out[_NO_SLICE]:
             check_suffix(file)
         raise NoSeries(f"{folder} holds no DICOM image with a position. Give the slices' folder.")
-    groups = [by_key[key] for key in sorted(by_key, key=lambda key: (-len(by_key[key]), repr(key)))]
     notes = tuple(
         f"{len(paths)} files are {what}: left out ({_named([p.name for p in paths])})"
         for what, paths in left_out.items()
         if paths
     )
-    return groups, notes
+    order = sorted(by_key, key=lambda key: (-len(by_key[key]), repr(key)))
+    return [by_key[key] for key in order], notes
 
 
 def _read_tags(path: Path) -> list[_Slice] | str:
@@ -240,27 +246,21 @@ def _read_tags(path: Path) -> list[_Slice] | str:
                 "".join(c if c.isprintable() else "?" for c in str(tags.get(tag) or ""))
                 for tag in ("SeriesInstanceUID", "SeriesDescription", "Modality", "PatientID")
             )
-            count = int(tags.get("NumberOfFrames") or 1)
-            pixel_fault = _pixel_fault(tags, stream, count)
+            patient_id = patient_id.strip()[:64].strip()  # as long as the standard allows
+            laterality = str(tags.get("ImageLaterality") or tags.get("Laterality") or "")
+            instance = str(tags.get("SOPInstanceUID") or path)
+            words = path, uid, description, modality, patient_id, laterality, instance
+            shape, count = (int(tags.Rows), int(tags.Columns)), int(tags.get("NumberOfFrames") or 1)
+            pixels = shape, count == 1, _pixel_fault(tags, stream, count)
             return [
-                _Slice(
-                    path,
-                    uid,
-                    description,
-                    modality,
-                    shape=(int(tags.Rows), int(tags.Columns)),
-                    plane=(plane := plane_of(group)),
-                    fault=_plane_fault(plane) or pixel_fault,
-                    patient_id=patient_id.strip()[:64].strip(),  # as long as the standard allows
-                    laterality=str(tags.get("ImageLaterality") or tags.get("Laterality") or ""),
-                    frame=frame,
-                    instance=str(tags.get("SOPInstanceUID") or path),
-                    classic=count == 1,
-                )
+                _Slice(*words, *pixels, plane_of(group), frame)
                 for frame, group in enumerate(frame_groups(tags, count))
             ]
         except Exception as error:  # pydicom raises anything on a foreign or damaged file
-            if is_dicom and _should_be_slice(tags):
+            kind = _CT  # unless it gets as far as to say another one
+            with suppress(Exception):
+                kind = tags.file_meta.get("MediaStorageSOPClassUID")
+            if is_dicom and kind == _CT:
                 raise InputError(f"{path} is cut short or damaged ({error}). {_AGAIN}") from error
             return _NO_SLICE
 
@@ -304,20 +304,6 @@ def plane_of(group: Callable[[str], Any]) -> Plane:
     )
 
 
-def _plane_fault(plane: Plane) -> str:
-    if min(plane.spacing_mm) <= 0:
-        return f"PixelSpacing {plane.spacing_mm} must be above 0"
-    return f"RescaleSlope {plane.scale[0]:g} must be above 0" if plane.scale[0] <= 0 else ""
-
-
-def _should_be_slice(tags: Any) -> bool:
-    """Whether an unreadable file calls itself a CT slice, or does not get as far as to say."""
-    try:
-        return tags is None or tags.file_meta.get("MediaStorageSOPClassUID") == _CT
-    except Exception:  # likewise
-        return True
-
-
 def _pixel_fault(tags: Any, stream: BinaryIO, frames: int) -> str:
     """What is wrong with the kind and length of the pixel data, at which the stream stands:
     decoders pad what is missing and allocate whatever is claimed."""
@@ -359,9 +345,8 @@ def _choose(folder: Path, groups: list[list[_Slice]], series: str | None) -> lis
     )
 
 
-def _slice_step(slices: list[_Slice], normal: np.ndarray) -> np.ndarray:
+def _slice_step(folder: Path, slices: list[_Slice], normal: np.ndarray) -> np.ndarray:
     """The vector from one slice to the next, after checking that all slices follow it."""
-    folder = slices[0].path.parent
     spacings = [s.plane.spacing_mm for s in slices]
     if np.ptp(spacings, axis=0).max() > _SAME_SPACING * max(spacings[0]):
         raise InputError(f"{folder}: its slices differ in pixel spacing.")
@@ -369,8 +354,7 @@ def _slice_step(slices: list[_Slice], normal: np.ndarray) -> np.ndarray:
         raise InputError(f"{folder}: one slice is no volume.")
     positions = np.array([s.plane.position_mm for s in slices])
     along = positions @ normal
-    gaps = np.diff(along)
-    usual = float(np.median(gaps))
+    usual = float(np.median(gaps := np.diff(along)))
     for n in np.flatnonzero(np.abs(gaps - usual) > max(0.02, 0.05 * abs(usual))):
         doubled = gaps[n] < 0.5 * usual or usual < 0.01
         kind = "two slices lie at" if doubled else "a slice is missing after"
@@ -379,8 +363,9 @@ def _slice_step(slices: list[_Slice], normal: np.ndarray) -> np.ndarray:
             f"{slices[n + 1].path.name}: {gaps[n]:.2f} mm, usually {usual:.2f} mm). {_AGAIN}"
         )
     step = (positions[-1] - positions[0]) / (len(slices) - 1)
-    line = positions[0] + np.arange(len(slices))[:, None] * step
-    off_mm = np.linalg.norm(positions - line, axis=1)
+    off_mm = np.linalg.norm(
+        positions - positions[0] - np.outer(np.arange(len(slices)), step), axis=1
+    )
     if off_mm.max() > max(0.1, 0.1 * abs(usual)):
         stray = slices[int(off_mm.argmax())].path
         raise InputError(f"{stray} lies {off_mm.max():.2f} mm off the others' line. {_AGAIN}")

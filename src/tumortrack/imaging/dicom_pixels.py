@@ -95,7 +95,10 @@ def _stored(tags: Dataset, index: int) -> Integer[np.ndarray, "rows columns"]:
     syntax = tags.file_meta.TransferSyntaxUID
     plugin = "pydicom"
     if syntax.is_encapsulated and syntax != RLELossless:
-        _silence_gdcm()
+        import gdcm
+
+        gdcm.Trace.WarningOff()  # it prints what pydicom raises as exceptions anyway
+        gdcm.Trace.ErrorOff()
         plugin = "gdcm"
         count = int(tags.get("NumberOfFrames") or 1)
         frame = get_frame(tags.PixelData, index, number_of_frames=count)
@@ -159,11 +162,3 @@ def _j2k_header(frame: bytes) -> _Picture:
 def _check_ends(frame: bytes, start: bytes) -> None:
     if not frame.startswith(start) or not frame.rstrip(b"\0").endswith(_END):
         raise ValueError(_DAMAGED)
-
-
-def _silence_gdcm() -> None:
-    """GDCM prints its errors, which pydicom raises as exceptions anyway."""
-    import gdcm
-
-    gdcm.Trace.WarningOff()
-    gdcm.Trace.ErrorOff()

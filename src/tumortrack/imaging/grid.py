@@ -33,7 +33,6 @@ _SAVE_AS = {  # of formats that no reader here knows
     (".mha", ".mhd", ".mgz", ".mgh", ".mnc", ".npy", ".npz", ".vti", ".tif"): ".nii.gz or .nrrd",
     (".vtk", ".vtp", ".vtu", ".glb", ".gltf", ".3mf", ".off"): "STL, OBJ or PLY",
 }
-CHUNK = 2**16  # labels at once: they stay in the cache
 
 
 class Segment(NamedTuple):
@@ -73,11 +72,9 @@ def check_size(
 ) -> None:
     """Check, before anything is allocated, that a shape is a 3-D volume within the limits and that
     the file (``stored`` bytes; None: its size) is long enough for it; InputError where not."""
-    dims = " x ".join(str(n) for n in shape)
+    dims = " x ".join(map(str, shape))
     if len(shape) != 3:
-        raise InputError(
-            f"{path} has {len(shape)} axes ({dims}). Export a single phase or channel."
-        )
+        raise InputError(f"{path} has {len(shape)} axes ({dims}). Export one phase or channel.")
     if min(shape) < 2:
         raise InputError(f"{path} is {dims} voxels: a flat image. Give a whole 3-D volume.")
     voxels = math.prod(int(n) for n in shape)
@@ -156,15 +153,9 @@ def face_areas_mm2(lps_from_index: Float[np.ndarray, "4 4"]) -> Float[np.ndarray
 
 
 def label_counts(labels: UInt8[np.ndarray, "i j k"]) -> Int64[np.ndarray, " 256"]:
-    """How many voxels have each label."""
-    flat = labels.ravel(order="K")
-    counts = np.zeros(256, np.int64)
-    for start in range(0, len(flat), CHUNK):
-        chunk = flat[start : start + CHUNK]
-        inside = chunk[chunk > 0]  # few, and bincount makes eight bytes of each
-        counts += np.bincount(inside, minlength=256)
-        counts[0] += len(chunk) - len(inside)
-    return counts
+    """How many voxels have each label. Layer by layer: bincount makes eight bytes of each voxel."""
+    along = labels if labels.strides[0] >= labels.strides[2] else labels.T
+    return np.sum([np.bincount(layer.ravel(), minlength=256) for layer in along], axis=0)
 
 
 def components(mask: Bool[np.ndarray, "i j k"]) -> tuple[Int32[np.ndarray, "i j k"], np.ndarray]:

@@ -3,10 +3,9 @@ registration block and partial-volume rims; the one free-standing organ is found
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
 from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
@@ -62,10 +61,9 @@ def segment_ct(
     box = bounding_box(organ, affine, _REACH_MM)
     affine = grids.moved_origin(affine, box)
     organ, tumors, more = _find_tumors(organ[box], solid[box], dense[box], affine, min_tumor_ml)
-    kept_ml = float(organ.sum()) * voxel_ml(affine)
     note = (
-        f"{kept_ml:.1f} ml of {everything_ml:.1f} ml between the HU limits are the organ; table, "
-        "blocks, rims and specks were dropped"
+        f"{float(organ.sum()) * voxel_ml(affine):.1f} ml of {everything_ml:.1f} ml between the HU "
+        "limits are the organ; table, blocks, rims and specks were dropped"
     )
     if len(tumors) > 254:
         raise InputError(f"{len(tumors)} tumors found; raise --min-tumor-ml or check --tumor-hu.")
@@ -106,14 +104,11 @@ def _find_tumors(
         tumors.append(tumor)
     notes = []
     if small:
-        notes.append(
-            f"{len(small)} bright pieces below {min_tumor_ml:g} ml became organ (largest "
-            f"{max(small):.3f} ml)"
-        )
+        what = f"below {min_tumor_ml:g} ml became organ (largest {max(small):.3f} ml)"
+        notes.append(f"{len(small)} bright pieces {what}")
     if beside:
-        notes.append(
-            f"{len(beside)} bright pieces beside the organ dropped (largest {max(beside):.1f} ml)"
-        )
+        what = f"beside the organ dropped (largest {max(beside):.1f} ml)"
+        notes.append(f"{len(beside)} bright pieces {what}")
     if not tumors:
         notes.append("no tumor found in this organ")
     organ = ndimage.binary_fill_holes(components(organ)[0] == 1)
@@ -128,19 +123,15 @@ def _opened(mask: np.ndarray, steps_mm: np.ndarray, radius_mm: float) -> np.ndar
     return mask & (ndimage.distance_transform_edt(~inner, sampling=steps_mm) <= radius_mm)
 
 
-@dataclass(frozen=True, eq=False)
-class _Grid:
+class _Grid(NamedTuple):
     """The masks on coarse cells, and which sizes an organ may have."""
 
-    solid: Bool[np.ndarray, "i j k"]
-    dense: Bool[np.ndarray, "i j k"]
-    lps_from_index: Float[np.ndarray, "4 4"]
+    solid: np.ndarray
+    dense: np.ndarray
+    lps_from_index: np.ndarray
+    steps_mm: np.ndarray
     organ_ml: tuple[float, float]
     longest_mm: float
-
-    @property
-    def steps_mm(self) -> np.ndarray:
-        return spacing_mm(self.lps_from_index)
 
 
 def _find_organ(
@@ -153,16 +144,11 @@ def _find_organ(
     (watershed of the distance to the background). The largest such piece is the organ; a deeper cut
     replaces it only if that frees it of a sheet. Attached thin sheets are removed.
     """
-    from skimage.measure import block_reduce
-
     factors = np.maximum(1, np.rint(_STEP_MM / spacing_mm(lps_from_index)).astype(int))
-    # Blocks at the ends are padded with False.
-    single, blocks = {"dtype": np.float32}, tuple(factors.tolist())
-    coarse_solid, coarse_dense = (
-        block_reduce(mask, blocks, np.mean, func_kwargs=single) >= 0.5 for mask in (solid, dense)
-    )
+    coarse = lps_from_index @ np.diag([*factors, 1.0])
     sizes = _KIDNEY_SIZES if kind.name == KIDNEY.name else _OTHER_SIZES
-    grid = _Grid(coarse_solid, coarse_dense, lps_from_index @ np.diag([*factors, 1.0]), *sizes)
+    cells = _coarse(solid, factors), _coarse(dense, factors)
+    grid = _Grid(*cells, coarse, spacing_mm(coarse), *sizes)
     region = _search(grid) if grid.solid.any() else None
     if region is None:
         raise InputError(
@@ -172,6 +158,14 @@ def _find_organ(
             "CT segment the organ first and give the label map with --labels."
         )
     return _refine(region, grid.solid & ~region, solid, factors)
+
+
+def _coarse(mask: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """Blocks of voxels of which half or more are True; False beyond the ends."""
+    padded = np.pad(mask, [(0, -n % f) for n, f in zip(mask.shape, factors.tolist(), strict=True)])
+    i, j, k = factors.tolist()
+    x, y, z = np.array(padded.shape) // factors
+    return 2 * padded.reshape(x, i, y, j, z, k).sum((1, 3, 5), dtype=np.int32) >= i * j * k
 
 
 def _search(grid: _Grid) -> np.ndarray | None:

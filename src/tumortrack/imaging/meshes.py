@@ -44,12 +44,9 @@ def read_meshes(
     """Read one organ and its tumors, LPS mm, from the meshes among files; and notes on every
     change.
 
-    Files are LPS unless a comment in them states ``SPACE=RAS``. ``unit``: None is mm; metres are
-    then recognised and refused. Small holes, doubled faces, inside-out surfaces and
-    self-intersections are repaired. The organ becomes the union of organ and tumors; each piece of
-    a tumor's file is a tumor. Raises InputError: unclear names, open or damaged meshes, wrong unit,
-    a tumor apart from the organ.
-    """
+    ``unit``: None is mm; metres are then recognised and refused. The organ becomes the union of
+    organ and tumors; each piece of a tumor's file is a tumor. Raises InputError: unclear names,
+    open or damaged meshes, wrong unit, a tumor apart from the organ."""
     if unit not in (None, "mm", "m"):
         raise InputError(f"unit {unit!r} is not allowed: mm or m.")
     files = _files_by_name(paths, kind.name)
@@ -77,11 +74,10 @@ def read_meshes(
 
 
 def _dropped(name: str, pieces_ml: list[float]) -> list[Note]:
-    large = [ml for ml in pieces_ml if ml >= LEAST_DROPPED_ML]
-    notes: list[Note] = [Finding("dropped", {"what": name, "ml": ml}) for ml in large]
     specks = [ml for ml in pieces_ml if ml < LEAST_DROPPED_ML]
+    large = [Finding("dropped", {"what": name, "ml": ml}) for ml in pieces_ml if ml not in specks]
     words = f"{name}: {len(specks)} specks of together {sum(specks):.3f} ml dropped"
-    return [*notes, words] if specks else notes
+    return [*large, words] if specks else [*large]
 
 
 def label_meshes(anatomy: Anatomy) -> LabelVolume:
@@ -100,9 +96,9 @@ def _files_by_name(paths: Sequence[Path], organ: str) -> list[Path]:
     """The organ's file, then the tumors'."""
     files = sorted((p for p in paths if p.suffix.lower() in SUFFIXES), key=natural)
     tumors = [f for f in files if is_tumor(f.stem)]  # also kidney_tumor.stl
-    named = [f for f in files if organ in f.stem.lower() or "organ" in f.stem.lower()]
-    organs = [f for f in named if f not in tumors]
-    other = [f.name for f in files if f not in organs and f not in tumors]
+    rest = [f for f in files if f not in tumors]
+    organs = [f for f in rest if organ in f.stem.lower() or "organ" in f.stem.lower()]
+    other = [f.name for f in rest if f not in organs]
     if len(organs) != 1 or other:
         problem = f"{len(organs)} name an organ" + (f", {other} name neither" if other else "")
         raise InputError(f"of {[f.name for f in files]} {problem}. {_RULE.format(organ)}")
@@ -138,15 +134,13 @@ def _stated_space(path: Path) -> str | None:
 
 
 def _check_unit(path: Path, organ: Mesh, unit: str | None) -> None:
-    extent = organ.longest_mm
-    low, high = _ORGAN_MM
-    if low <= extent <= high:
-        return
-    if unit != "m" and low <= 1000 * extent <= high:
-        raise InputError(f"{path} is {extent:.3g} mm long: it looks like metres. Give --unit m.")
-    raise InputError(
-        f"{path} is {extent:.4g} mm long; an organ has {low:g} to {high:g} mm. Check its unit."
-    )
+    extent, (low, high) = organ.longest_mm, _ORGAN_MM
+    if not low <= extent <= high:
+        is_metres = unit != "m" and low <= 1000 * extent <= high
+        what = "it looks like metres. Give --unit m" if is_metres else "check its unit"
+        raise InputError(
+            f"{path} is {extent:.4g} mm long; an organ has {low:g} to {high:g} mm: {what}."
+        )
 
 
 def _union(organ: Mesh, tumor: Mesh, name: str) -> Mesh:
@@ -280,9 +274,9 @@ def solid_of(mesh: Mesh, name: str) -> Any:
 
     raw = manifold3d.Mesh64(mesh.vertices_mm.copy(), mesh.faces.astype(np.uint64))
     solid = manifold3d.Manifold(raw)
-    if solid.status() != manifold3d.Error.NoError or solid.volume() <= 0:
-        status = solid.status().name
-        raise InputError(f"{name} is no closed surface with faces outward ({status}). Repair it.")
+    if (status := solid.status()) != manifold3d.Error.NoError or solid.volume() <= 0:
+        what = f"is no closed surface with faces outward ({status.name})"
+        raise InputError(f"{name} {what}. Repair it.")
     return solid
 
 

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Num
+from scipy.spatial.transform import Rotation
 
 from tumortrack.core.errors import InputError, readable
 from tumortrack.core.geometry import RAS_FROM_LPS, spacing_mm
@@ -24,18 +25,15 @@ from tumortrack.core.store import write_atomically
 from tumortrack.imaging import grid
 
 GZIP_LEVEL = 4  # higher ones take several times longer and save little
-_HEADER = np.dtype(  # the fields that are written; all others are 0
-    {
-        "names": ["sizeof_hdr", "dim", "datatype", "bitpix", "pixdim", "vox_offset"]
-        + ["scl_slope", "xyzt_units", "qform_code", "sform_code", "quaternion", "offset"]
-        + ["srow", "magic"],
-        "formats": ["<i4", ("<i2", 8), "<i2", "<i2", ("<f4", 8), "<f4"]
-        + ["<f4", "u1", "<i2", "<i2", ("<f4", 3), ("<f4", 3)]
-        + [("<f4", (3, 4)), "S4"],
-        "offsets": [0, 40, 70, 72, 76, 108, 112, 123, 252, 254, 256, 268, 280, 344],
-        "itemsize": 352,  # the last four bytes: no extension follows
-    }
-)
+_FIELDS: dict[str, tuple[Any, int]] = {  # types and offsets of what is written; all others are 0
+    "sizeof_hdr": ("<i4", 0), "dim": (("<i2", 8), 40), "datatype": ("<i2", 70),
+    "bitpix": ("<i2", 72), "pixdim": (("<f4", 8), 76), "vox_offset": ("<f4", 108),
+    "scl_slope": ("<f4", 112), "xyzt_units": ("u1", 123), "qform_code": ("<i2", 252),
+    "sform_code": ("<i2", 254), "quaternion": (("<f4", 3), 256), "offset": (("<f4", 3), 268),
+    "srow": (("<f4", (3, 4)), 280), "magic": ("S8", 344),  # and that no extension follows
+}  # fmt: skip
+_FORMATS, _OFFSETS = zip(*_FIELDS.values(), strict=True)
+_HEADER = np.dtype({"names": [*_FIELDS], "formats": _FORMATS, "offsets": _OFFSETS})
 _TYPES = {"u1": 2, "i2": 4, "i4": 8, "f4": 16, "f8": 64, "i1": 256, "u2": 512, "u4": 768}
 _MM, _SCANNER = 2, 1
 _EQUAL_STEPS = 0.01  # of sform and qform, relatively
@@ -51,14 +49,15 @@ _SILENT = logging.Logger("nibabel", logging.CRITICAL)  # nibabel logs each repai
 
 def read_nifti(path: Path) -> grid.RawVolume:
     """Read .nii or .nii.gz. The sform is used, or the qform without one. Raises InputError:
-    damaged, not 3-D, too large, without or with contradictory orientation, not in millimetres."""
+    damaged, not 3-D, too large, without or with contradictory orientation, not in millimetres.
+
+    ``nibabel.load`` would trust the stated length of extensions and skip the checksum."""
     compressed = path.suffix.lower() == ".gz"
     with grid.volume_stream(path, compressed) as stream:
         return _read(path, stream, compressed)
 
 
 def _read(path: Path, stream: BufferedIOBase, compressed: bool) -> grid.RawVolume:
-    """``nibabel.load`` would trust the stated length of extensions and skip the checksum."""
     load_pydicom()
     import nibabel
     from nibabel.volumeutils import apply_read_scaling
@@ -141,14 +140,10 @@ def write_nifti(
     frame_from_index: Float[np.ndarray, "4 4"],
     lps: bool,
 ) -> None:
-    """Write an array in its own number type as .nii or .nii.gz, units mm. Raises InputError:
-    a number type that NIfTI does not know, or more than 32,767 voxels along an axis; StorageError:
-    the disk refused; an older file is untouched.
-
-    Args:
-        lps: the frame is the patient's, LPS, and is converted to RAS; False: the camera's, which is
-            written as it is.
-    """
+    """Write an array in its own number type as .nii or .nii.gz, units mm. ``lps``: the frame is the
+    patient's, converted to RAS; False: the camera's, written as it is. Raises InputError: a number
+    type that NIfTI does not know, or more than 32,767 voxels along an axis; StorageError: the disk
+    refused; an older file is untouched."""
     kind = f"{array.dtype.kind}{array.dtype.itemsize}"
     if kind not in _TYPES or max(array.shape) > np.iinfo(np.int16).max:
         raise InputError(
@@ -169,24 +164,13 @@ def write_nifti(
     # A quaternion cannot hold shear; the sform alone is right for every affine.
     if np.allclose(axes.T @ axes, np.eye(3), atol=1e-4):
         header["qform_code"], header["offset"] = _SCANNER, affine[:3, 3]
-        header["quaternion"] = _quaternion(axes * [1, 1, handedness])
+        rotation = Rotation.from_matrix(axes * [1, 1, handedness])
+        header["quaternion"] = rotation.as_quat(canonical=True)[:3]
     voxels = array.astype(array.dtype.newbyteorder("<"), copy=False)
     content = header.tobytes() + voxels.tobytes(order="F")
     if path.name.endswith(".gz"):
         content = gzip.compress(content, compresslevel=GZIP_LEVEL, mtime=0)
     write_atomically(path, content)
-
-
-def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, " 3"]:
-    """b, c and d of a rotation's quaternion with a >= 0 (Bar-Itzhack 2000, doi 10.2514/2.4654: the
-    eigenvector of the largest eigenvalue)."""
-    whole = np.zeros((4, 4))
-    whole[:3, :3] = rotation + rotation.T - np.trace(rotation) * np.eye(3)
-    b, c, d = rotation[2, 1], rotation[0, 2], rotation[1, 0]
-    whole[3] = whole[:, 3] = [b - rotation[1, 2], c - rotation[2, 0], d - rotation[0, 1], 0]
-    whole[3, 3] = np.trace(rotation)
-    bcda = np.linalg.eigh(whole)[1][:, -1]
-    return bcda[:3] if bcda[3] >= 0 else -bcda[:3]
 
 
 def write_volume_nifti(

@@ -21,13 +21,7 @@ from tumortrack.core.patient import UNKNOWN, Patient, Side
 from tumortrack.core.report import Finding, Kind, Note
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.imaging.case import Case
-from tumortrack.imaging.grid import (
-    check_suffix,
-    face_areas_mm2,
-    grown_box,
-    label_counts,
-    voxel_ml,
-)
+from tumortrack.imaging.grid import check_suffix, face_areas_mm2, grown_box, label_counts, voxel_ml
 from tumortrack.imaging.hu_windows import segment_ct
 from tumortrack.imaging.meshes import LEAST_DROPPED_ML, label_meshes, read_meshes
 from tumortrack.imaging.options import PrepareOptions, parse_structures
@@ -82,8 +76,8 @@ def prepare(input: Path | Sequence[Path], options: PrepareOptions | None = None)
             check_suffix(path)
         case = _from_meshes(files, options) if is_meshes else _from_volume(paths, files, options)
         _check_organ_outside(case.labels)
-        notes = [*case.report["notes"], *_large_tumors(case), *options.kind.doubts()]
-        case = _with_structures(replace(case, report={**case.report, "notes": notes}), options)
+        case = _noted(case, [*_large_tumors(case), *options.kind.doubts()])
+        case = _with_structures(case, options)
         if options.ct is not None:
             case = _with_ct(case, options.ct)
         source_sha256 = " ".join(map(store.sha256_of, paths))
@@ -123,6 +117,11 @@ def _files_in(paths: list[Path]) -> list[Path]:
     return sorted(files, key=store.natural)
 
 
+def _noted(case: Case, notes: Sequence[Note], **report: Any) -> Case:
+    """The case with more notes, and with more in its report."""
+    return replace(case, report={**case.report, **report, "notes": [*case.report["notes"], *notes]})
+
+
 def _with_structures(case: Case, options: PrepareOptions) -> Case:
     """The case with structures from mesh files as well, and a report on all structures."""
     sources = parse_structures(options.structure, options.name)
@@ -132,9 +131,8 @@ def _with_structures(case: Case, options: PrepareOptions) -> Case:
     if missing := [name for name in sources if name not in structures]:
         raise InputError(f"--structure {missing[0]}: without a label map it takes a mesh's file.")
     extents, more = extent_report(structures, case.anatomy, case.labels)
-    report = {**case.report, "notes": [*case.report["notes"], *notes, *more]}
-    anatomy = replace(case.anatomy, structures=structures)
-    return replace(case, anatomy=anatomy, report={**report, "structures": extents})
+    case = replace(case, anatomy=replace(case.anatomy, structures=structures))
+    return _noted(case, [*notes, *more], structures=extents)
 
 
 def _check_organ_outside(labels: LabelVolume) -> None:
@@ -236,8 +234,8 @@ def _selected(
             f"{path} is of a {other} by its name. Give --name {other}, or --organ NUMBER of the "
             f"{options.kind.words}."
         )
-    present = np.flatnonzero(counts).tolist()
-    used = organ, *([n for n in present if n >= FIRST_TUMOR] if tumors is None else tumors)
+    others = [n for n in np.flatnonzero(counts).tolist() if n >= FIRST_TUMOR]
+    used = organ, *(others if tumors is None else tumors)
     _check_every_slice(among(volume.labels, used), volume.lps_from_index, path)
     source, structures = split_structures(volume, parts.structures, organ)
     selection = options.stated_side, organ, tumors, options.min_tumor_ml, options.kind
@@ -355,11 +353,10 @@ def _with_ct(case: Case, path: Path) -> Case:
         raise InputError(f"--ct {path}: its voxels are not the labels'. Resample one of the two.")
     if case.patient.differs(raw.patient):
         raise InputError(f"--ct {path} is of {raw.patient}, the labels of {case.patient}.")
-    notes = case.report["notes"]
-    if not any(isinstance(note, Finding) and note.kind == "cut" for note in notes):
-        words = case.anatomy.kind.words
-        notes = [*notes, *_cut(words, case.labels, volume.hu.shape, volume.lps_from_index)]
-    return replace(case, ct=crop_ct(volume, case.labels), report={**case.report, "notes": notes})
+    cut = _cut(case.anatomy.kind.words, case.labels, volume.hu.shape, volume.lps_from_index)
+    known = {note.kind for note in case.report["notes"] if isinstance(note, Finding)}
+    case = replace(case, ct=crop_ct(volume, case.labels))
+    return _noted(case, [] if "cut" in known else cut)
 
 
 def _turned_as(volume: Volume, affine: np.ndarray) -> Volume:

@@ -28,9 +28,8 @@ _fill_windings = kernel("fill_windings", _RAYS, Array(np.int16)["i", "j", "k"].o
 def winding_numbers(
     mesh: Mesh, frame_from_index: Float[np.ndarray, "4 4"], shape: tuple[int, int, int]
 ) -> Int16[np.ndarray, "i j k"]:
-    """The winding number at voxel centres (integer indices), by rays along the last axis: each
-    triangle adds +1 or -1 to every voxel behind it. A closed mesh whose faces turn outward and that
-    does not cross itself gives 0 outside and 1 inside. Raises InputError: the grid is too large."""
+    """The winding number at voxel centres: of a closed mesh whose faces turn outward and that does
+    not cross itself 0 outside and 1 inside. Raises InputError: the grid is too large."""
     out = _zeros(shape, np.int16)
     _fill(mesh, frame_from_index, out, 0)
     return out

@@ -40,23 +40,19 @@ _SERIES_NUMBER = 900
 
 
 class Term(NamedTuple):
-    """A coded concept, in the order of pydicom's ``Code``."""
+    """A concept of SNOMED CT."""
 
     code: str
-    scheme: str
     meaning: str
 
     def __str__(self) -> str:
-        return "^".join((self.scheme, self.code, self.meaning))
+        return f"SCT^{self.code}^{self.meaning}"
 
 
-STRUCTURE = Term("123037004", "SCT", "Anatomical Structure")
-ALTERED = Term("49755003", "SCT", "Morphologically Altered Structure")
-MASS = Term("4147007", "SCT", "Mass")
-_SIDES: dict[Side, Term] = {
-    "left": Term("7771000", "SCT", "Left"),
-    "right": Term("24028007", "SCT", "Right"),
-}
+STRUCTURE = Term("123037004", "Anatomical Structure")
+ALTERED = Term("49755003", "Morphologically Altered Structure")
+MASS = Term("4147007", "Mass")
+_SIDES: dict[Side, Term] = {"left": Term("7771000", "Left"), "right": Term("24028007", "Right")}
 
 
 @dataclass(frozen=True)
@@ -75,8 +71,7 @@ class Segment:
     @property
     def region(self) -> Term:
         """The organ that it is or lies in."""
-        code, meaning = self.organ.snomed
-        return Term(code, "SCT", meaning)
+        return Term(*self.organ.snomed)
 
     @property
     def terms(self) -> tuple[Term, Term]:
@@ -135,17 +130,11 @@ def write_dicom_seg(
     series: str | None = None,
     patient: Patient = NOBODY,
 ) -> tuple[str, ...]:
-    """Write ``labels`` as a binary segmentation of the CT in ``folder``, which viewers overlay.
+    """Write ``labels``, one of ``parts`` each, as a binary segmentation of the CT that ``folder``
+    and ``series`` name, whose voxels must coincide with theirs (axes may be permuted or flipped).
     Returns notes on what else was in the folder. Raises InputError: no such series; another
-    patient's; another grid; slices that lack what a segmentation must repeat; highdicom is not
-    installed; StorageError: the disk refused.
-
-    Args:
-        parts: one for each label, in order.
-        folder, series: the CT, as for ``read_dicom``. Its voxels must coincide with the labels'
-            (axes may be permuted or flipped).
-        patient: of the labels.
-    """
+    patient's than ``patient``; another grid; slices that lack what a segmentation must repeat;
+    highdicom is not installed; StorageError: the disk refused."""
     ct = find_series(folder, series)
     import pydicom
 
@@ -180,9 +169,7 @@ def _resampled(labels: LabelVolume, series: Series, folder: Path) -> UInt8[np.nd
     inside = np.argwhere(labels.labels > 0)
     index = np.rint(transform_points(ct_from_index, inside.astype(float))).astype(int)
     if (index < 0).any() or (index >= series.shape).any():
-        raise InputError(
-            f"{folder}: the case's labels reach beyond this CT. Give its whole series."
-        )
+        raise InputError(f"{folder}: the labels reach beyond this CT. Give its whole series.")
     pixels = np.zeros(series.shape[::-1], np.uint8)
     pixels[tuple(index.T[::-1])] = labels.labels[tuple(inside.T)]
     return pixels
@@ -194,9 +181,8 @@ def _segmentation(
     try:
         import highdicom as hd
     except ImportError as error:
-        raise InputError(
-            f"--dicom needs highdicom (Python up to 3.13): {to_install('tumortrack[dicom]')}."
-        ) from error
+        how = to_install("tumortrack[dicom]")
+        raise InputError(f"--dicom needs highdicom (Python up to 3.13): {how}.") from error
     from pydicom.uid import generate_uid
 
     digest = hashlib.sha256(pixels.tobytes())
@@ -232,7 +218,10 @@ def _description(part: Segment) -> Any:
     from pydicom.sr.codedict import codes
     from pydicom.sr.coding import Code
 
-    category, kind = (Code(*term) for term in part.terms)
+    def code(term: Term) -> Any:
+        return Code(term.code, "SCT", term.meaning)
+
+    category, kind = map(code, part.terms)
     description = hd.seg.SegmentDescription(
         segment_number=part.label,
         segment_label=part.name,
@@ -243,14 +232,14 @@ def _description(part: Segment) -> Any:
         algorithm_identification=hd.AlgorithmIdentificationSequence(
             "tumortrack prepare", codes.cid7162.MorphologicalOperations, tumortrack.__version__
         ),
-        anatomic_regions=None if part.is_organ else [Code(*part.region)],
+        anatomic_regions=None if part.is_organ else [code(part.region)],
         display_color=hd.color.CIELabColor.from_rgb(*part.rgb),
     )
     if part.side in _SIDES:
-        side = [hd.sr.CodedConcept(*_SIDES[part.side])]
+        side = [hd.sr.CodedConcept.from_code(code(_SIDES[part.side]))]
         if part.is_organ:
-            kind_item = description.SegmentedPropertyTypeCodeSequence[0]
-            kind_item.SegmentedPropertyTypeModifierCodeSequence = side
+            item = description.SegmentedPropertyTypeCodeSequence[0]
+            item.SegmentedPropertyTypeModifierCodeSequence = side
         else:
             description.AnatomicRegionSequence[0].AnatomicRegionModifierSequence = side
     return description

@@ -1,9 +1,7 @@
 """Segment a CT with the user's own tool: TotalSegmentator, an nnU-Net model, a MONAI bundle.
 
 The tool runs in its own process by its own command line, with weights that are on this machine;
-nothing is downloaded. Its labels are mapped by name: 1 the organ, 2 its tumors. Documentation:
-github.com/wasserth/TotalSegmentator (README, map_to_binary.py), github.com/MIC-DKFZ/nnUNet
-(how_to_use_nnunet.md), docs.monai.io (MONAI Bundle specification).
+nothing is downloaded. Its labels are mapped by name: 1 the organ, 2 its tumors.
 """
 
 from __future__ import annotations
@@ -15,24 +13,25 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
 
 from tumortrack.core import store
-from tumortrack.core.errors import InputError
-from tumortrack.core.types import FIRST_TUMOR, ORGAN, Volume
+from tumortrack.core.errors import InputError, readable
+from tumortrack.core.types import FIRST_TUMOR, ORGAN
 from tumortrack.imaging.case import Case
+from tumortrack.imaging.grid import RawVolume
 from tumortrack.imaging.nifti import write_nifti, write_volume_nifti
 from tumortrack.imaging.options import PrepareOptions
 from tumortrack.imaging.prepare import OF_LABELS, crop_ct, patient_of, prepare, refuse_unused
 from tumortrack.imaging.segments import is_tumor
-from tumortrack.imaging.volume import read_raw, volume_of
+from tumortrack.imaging.volume import read_raw, same_grid, volume_of
 
 # Datasets of TotalSegmentator's tasks, and the masks in them that count as tumors.
 _TOTAL = (291, 292, 293, 294, 295, 298)
@@ -41,38 +40,25 @@ _LESIONS = {
     "liver_vessels": (8, ("liver_tumor",)),
     "kidney_cysts": (789, ("kidney_cyst_left", "kidney_cyst_right")),
 }
-_SAME_MM = 0.01  # of the label map's grid
 # Masks of the organ and of its tumors; None: the tool knows no tumors.
 Masks = tuple[Bool[np.ndarray, "i j k"], Bool[np.ndarray, "i j k"] | None]
 
 
-@dataclass(frozen=True)
-class Tool:
+class Tool(NamedTuple):
     """``commands`` are run in a folder and turn in/ct_0000.nii.gz into files in out/, from which
     ``masks`` reads."""
 
     name: str
     package: str
-    weights: tuple[Path, ...]
-    commands: tuple[tuple[str, ...], ...]
-    masks: Callable[[Path, Volume], Masks]
-
-    @property
-    def version(self) -> str:
-        try:
-            return version(self.package)
-        except PackageNotFoundError:  # in another environment
-            return "(version unknown)"
+    weights: list[Path]
+    commands: list[tuple[str, ...]]
+    masks: Callable[[Path, RawVolume], Masks]
 
 
 def segmented_case(ct: Path, spec: str, options: PrepareOptions, keep: Path) -> Case:
-    """A case from a CT that a tool segments; its output is shown. Raises InputError: a tool that is
-    unknown, not installed, lacks its weights, fails or finds no such organ; and as ``prepare``.
-
-    Args:
-        spec: totalsegmentator, totalsegmentator:TASK, nnunet:FOLDER or monai:BUNDLE.
-        keep: file for the label map; must not exist.
-    """
+    """A case from a CT that a tool segments (``spec``: of ``prepare --segment``); its output is
+    shown. ``keep``: a new file for the label map. Raises InputError: a tool that is unknown, not
+    installed, lacks its weights, fails or finds no such organ; and as ``prepare``."""
     refuse_unused("--segment makes the labels", options, *OF_LABELS)
     if keep.exists():
         raise InputError(f"{keep} exists already. Move it away; it is what an earlier run found.")
@@ -81,12 +67,12 @@ def segmented_case(ct: Path, spec: str, options: PrepareOptions, keep: Path) -> 
     volume = volume_of(raw, ct)
     with tempfile.TemporaryDirectory(prefix="tumortrack-") as folder:
         work = Path(folder)
-        for name in ("in", "out"):
-            (work / name).mkdir()
+        (work / "in").mkdir()
+        (work / "out").mkdir()
         write_volume_nifti(work / "in" / "ct_0000.nii.gz", volume.hu, volume.lps_from_index)
         for command in tool.commands:
             _run(command, work)
-        organ, tumors = tool.masks(work / "out", volume)
+        organ, tumors = tool.masks(work / "out", raw)
     if not organ.any():
         raise InputError(f"{tool.name} found no {options.name} in {ct}. Look at the CT.")
     labels = np.where(organ, ORGAN, 0).astype(np.uint8)
@@ -96,16 +82,20 @@ def segmented_case(ct: Path, spec: str, options: PrepareOptions, keep: Path) -> 
     write_nifti(keep, labels, volume.lps_from_index, lps=True)
     tumor = FIRST_TUMOR if tumors is not None and tumors.any() else 0
     case = prepare(keep, replace(options, labels=True, series=None, organ=ORGAN, tumor=tumor))
+    try:
+        of_tool = version(tool.package)
+    except PackageNotFoundError:  # in another environment
+        of_tool = "(version unknown)"
     segmentation = {
         "tool": tool.name,
-        "version": tool.version,
+        "version": of_tool,
         "commands": [" ".join(command) for command in tool.commands],
         "weights_sha256": {path.name: store.sha256_of(path) for path in tool.weights},
         "label_map": keep.name,
         "ct": ct.name,
         "ct_sha256": store.sha256_of(ct),
     }
-    note = f"segmented by {tool.name} {tool.version}, and by nobody else: check it in qc.png"
+    note = f"segmented by {tool.name} {of_tool}, and by nobody else: check it in qc.png"
     notes = [*raw.notes, *case.report["notes"], note]
     report = case.report | {"kind": "segmented ct", "segmentation": segmentation, "notes": notes}
     patient = patient_of(ct, raw.patient, options.patient, case.patient.side)
@@ -127,13 +117,12 @@ def _tool(spec: str, organ: str) -> Tool:
 def _program(name: str, package: str) -> str:
     """The path of a program next to this Python or on the PATH."""
     folders = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
-    path = shutil.which(name, path=folders)
-    if path is None:
-        raise InputError(
-            f"{name} is not installed. Install it, which brings its own dependencies: pip install "
-            f"{package}. Its weights are apart (docs/segment.md)."
-        )
-    return path
+    if path := shutil.which(name, path=folders):
+        return path
+    raise InputError(
+        f"{name} is not installed. Install it, which brings its own dependencies: pip install "
+        f"{package}. Its weights are apart (docs/segment.md)."
+    )
 
 
 def _run(command: tuple[str, ...], work: Path) -> None:
@@ -150,33 +139,31 @@ def _run(command: tuple[str, ...], work: Path) -> None:
 def _totalsegmentator(task: str, organ: str) -> Tool:
     if task and task not in _LESIONS:
         raise InputError(f"--segment totalsegmentator:{task}: tasks are {', '.join(_LESIONS)}.")
-    program = _program("TotalSegmentator", "TotalSegmentator")
+    run = (_program("TotalSegmentator", "TotalSegmentator"), "-i", "in/ct_0000.nii.gz", "-o")
     home = Path(os.environ.get("TOTALSEG_HOME_DIR", Path.home() / ".totalsegmentator"))
     folder = Path(os.environ.get("TOTALSEG_WEIGHTS_PATH", home / "nnunet" / "results"))
     number, lesions = _LESIONS.get(task, (0, ()))
     weights = []
-    needed = [("total", dataset) for dataset in _TOTAL] + ([(task, number)] if task else [])
-    for needed_task, dataset in needed:
-        paths = sorted(folder.glob(f"Dataset{dataset:03d}_*"))
-        if not paths:
+    for dataset in (*_TOTAL, number) if task else _TOTAL:
+        if not (paths := sorted(folder.glob(f"Dataset{dataset:03d}_*"))):
+            of = "total" if dataset in _TOTAL else task
             raise InputError(
-                f"{folder} lacks the weights of TotalSegmentator's task {needed_task} (Dataset"
-                f"{dataset:03d}). Fetch them yourself: totalseg_download_weights -t {needed_task}. "
+                f"{folder} lacks the weights of TotalSegmentator's task {of} (Dataset"
+                f"{dataset:03d}). Fetch them yourself: totalseg_download_weights -t {of}. "
                 "TotalSegmentator would download them without asking, so it is not started."
             )
         weights += paths
     sides = [f"{organ}_left", f"{organ}_right"] if organ in ("kidney", "adrenal_gland") else [organ]
-    run = (program, "-i", "in/ct_0000.nii.gz", "-o")
     commands = [(*run, "out/total", "--task", "total", "--roi_subset", *sides)]
     commands += [(*run, "out/lesions", "--task", task)] if task else []
 
-    def masks(out: Path, ct: Volume) -> Masks:
+    def masks(out: Path, ct: RawVolume) -> Masks:
         def union(folder: Path, names: Iterable[str]) -> np.ndarray:
             return np.any([_voxels(folder / f"{name}.nii.gz", ct) > 0 for name in names], axis=0)
 
         return union(out / "total", sides), union(out / "lesions", lesions) if lesions else None
 
-    return Tool("TotalSegmentator", "TotalSegmentator", tuple(weights), tuple(commands), masks)
+    return Tool("TotalSegmentator", "TotalSegmentator", weights, commands, masks)
 
 
 def _nnunet(model: Path, organ: str) -> Tool:
@@ -197,8 +184,8 @@ def _nnunet(model: Path, organ: str) -> Tool:
         *(program, "-i", "in", "-o", "out", "-m", str(model), "-device", device),
         *("-npp", "1", "-nps", "1", "-f", *(fold.name.removeprefix("fold_") for fold in folds)),
     )
-    weights = (model / "dataset.json", model / "plans.json", *folds)
-    return Tool("nnU-Net", "nnunetv2", weights, (command,), _from_label_map(*numbers))
+    weights = [model / "dataset.json", model / "plans.json", *folds]
+    return Tool("nnU-Net", "nnunetv2", weights, [command], _from_label_map(*numbers))
 
 
 def _has_gpu() -> bool:
@@ -218,20 +205,19 @@ def _monai(bundle: Path, organ: str) -> Tool:
             f"{bundle} is no MONAI bundle with weights: it lacks models/. Fetch one yourself: "
             "python -m monai.bundle download NAME."
         )
-    meta = _json(bundle / "configs" / "metadata.json", "monai")
-    try:
+    configs = bundle / "configs"
+    meta = _json(configs / "metadata.json", "monai")
+    with readable(configs / "metadata.json", "does not name its labels"):
         channels = meta["network_data_format"]["outputs"]["pred"]["channel_def"]
         names = {str(name): int(number) for number, name in channels.items()}
-    except (KeyError, ValueError, AttributeError) as error:
-        raise InputError(f"{bundle}: metadata.json does not name its labels ({error}).") from error
     numbers = _numbers(names, organ, bundle)
-    config = next((bundle / "configs").glob("inference.*"), bundle / "configs" / "inference.json")
+    config = next(configs.glob("inference.*"), configs / "inference.json")
     command = (
         *(sys.executable, "-m", "monai.bundle", "run", "--config_file", str(config)),
-        *("--meta_file", str(bundle / "configs" / "metadata.json"), "--bundle_root", str(bundle)),
+        *("--meta_file", str(configs / "metadata.json"), "--bundle_root", str(bundle)),
         *("--datalist", "['in/ct_0000.nii.gz']", "--output_dir", "out"),
     )
-    return Tool("MONAI", "monai", (bundle,), (command,), _from_label_map(*numbers))
+    return Tool("MONAI", "monai", [bundle], [command], _from_label_map(*numbers))
 
 
 def _json(path: Path, kind: str) -> dict[str, Any]:
@@ -243,12 +229,10 @@ def _json(path: Path, kind: str) -> dict[str, Any]:
 def _numbers(labels: dict[str, Any], organ: str, where: Path) -> tuple[list[int], list[int]]:
     """Label numbers of the organ and of tumors, by name; an nnU-Net region has several."""
     numbers: dict[str, set[int]] = {}
-    try:
+    with readable(where, "has labels without numbers"):
         for name, value in labels.items():
             values = value if isinstance(value, list) else [int(value)]
             numbers[re.sub(r"[\s-]+", "_", name.lower())] = set(values)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{where}: its labels {str(labels)[:200]} have no numbers.") from error
     names = {organ, f"{organ}_left", f"{organ}_right", f"left_{organ}", f"right_{organ}"}
     tumors = {n for name in numbers if is_tumor(name) for n in numbers[name]}
     organs = {n for name in names & numbers.keys() for n in numbers[name]} - tumors
@@ -259,8 +243,8 @@ def _numbers(labels: dict[str, Any], organ: str, where: Path) -> tuple[list[int]
     return sorted(organs), sorted(tumors)
 
 
-def _from_label_map(organs: list[int], tumors: list[int]) -> Callable[[Path, Volume], Masks]:
-    def masks(out: Path, ct: Volume) -> Masks:
+def _from_label_map(organs: list[int], tumors: list[int]) -> Callable[[Path, RawVolume], Masks]:
+    def masks(out: Path, ct: RawVolume) -> Masks:
         files = sorted(out.rglob("*.nii.gz"))
         if len(files) != 1:
             raise InputError(f"the tool wrote {len(files)} label maps, and one was to be expected.")
@@ -270,14 +254,11 @@ def _from_label_map(organs: list[int], tumors: list[int]) -> Callable[[Path, Vol
     return masks
 
 
-def _voxels(file: Path, ct: Volume) -> np.ndarray:
+def _voxels(file: Path, ct: RawVolume) -> np.ndarray:
     """Voxels of a mask or label map on the CT's grid."""
     if not file.is_file():
-        raise InputError(
-            f"the tool ended well and wrote no {file.name}; it may be another version."
-        )
+        raise InputError(f"the tool wrote no {file.name}; it may be another version.")
     raw = read_raw(file)
-    same = raw.array.shape == ct.hu.shape
-    if not same or not np.allclose(raw.lps_from_index, ct.lps_from_index, atol=_SAME_MM):
+    if not same_grid(raw, ct):
         raise InputError(f"{file.name} has another grid than the CT that the tool was given.")
     return np.rint(raw.array).astype(np.int64)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int32, UInt8
+from jaxtyping import UInt8
 from scipy import ndimage
 
 from tumortrack.core.errors import InputError
@@ -29,38 +27,31 @@ _SPECK_ML = 0.5  # a larger piece that is dropped weakens the case
 _MOST_RUGGED = 60.0  # area of all labels' borders over volume^(2/3); a voxelised ball has 7
 
 
-@dataclass(frozen=True, eq=False)
 class _Pieces:
-    """Connected components of organ and tumor voxels: ``numbers`` 1, 2, ... largest first; 0
-    outside. ``labels`` are the map's, in which ``organ`` and ``tumors`` are those parts' values."""
+    """Connected pieces of organ and tumor voxels, ``numbers`` 1, 2, ... largest first, 0 outside;
+    and volumes by number."""
 
-    labels: UInt8[np.ndarray, "i j k"]
-    numbers: Int32[np.ndarray, "i j k"]
-    lps_from_index: Float[np.ndarray, "4 4"]
-    organ: int
-    tumors: tuple[int, ...]
+    def __init__(
+        self, labels: np.ndarray, affine: np.ndarray, organ: int, tumors: tuple[int, ...]
+    ) -> None:
+        self.labels, self.affine, self.organ, self.tumors = labels.copy(), affine, organ, tumors
+        self.numbers, _ = grid.components(among(labels, (organ, *tumors)))
+        self.measure()
 
-    @cached_property
-    def organ_ml(self) -> Float[np.ndarray, " n"]:
-        """Organ volume by piece number; entry 0, the outside, is 0."""
-        return self._ml((self.organ,))
+    def measure(self) -> None:
+        voxel_ml, size = grid.voxel_ml(self.affine), int(self.numbers.max()) + 1
+        self.organ_ml, self.tumor_ml = (
+            np.bincount(self.numbers[among(self.labels, values)], minlength=size) * voxel_ml
+            for values in ((self.organ,), self.tumors)
+        )
+        self.whole_ml = self.organ_ml + self.tumor_ml
 
-    @cached_property
-    def tumor_ml(self) -> Float[np.ndarray, " n"]:
-        return self._ml(self.tumors)
-
-    @property
-    def whole_ml(self) -> Float[np.ndarray, " n"]:
-        return self.organ_ml + self.tumor_ml
-
-    def _ml(self, values: tuple[int, ...]) -> np.ndarray:
-        inside = self.numbers[among(self.labels, values)]
-        count = np.bincount(inside, minlength=int(self.numbers.max()) + 1)
-        return count * grid.voxel_ml(self.lps_from_index)
+    def with_tumor(self, min_tumor_ml: float) -> list[int]:
+        return np.flatnonzero((self.tumor_ml > 0) & (self.tumor_ml >= min_tumor_ml)).tolist()
 
     def x_mm(self, number: int) -> float:
         """x of a piece's centre, LPS: increases towards the patient's left."""
-        return float((self.lps_from_index @ [*np.argwhere(self.numbers == number).mean(0), 1])[0])
+        return float((self.affine @ [*np.argwhere(self.numbers == number).mean(0), 1])[0])
 
 
 def select_labels(
@@ -84,17 +75,16 @@ def select_labels(
     two organs of a pair without tumor and no ``side``, the only tumor lies apart from every organ.
     """
     labels, affine = label_volume.labels, label_volume.lps_from_index
-    present = [int(n) for n in np.flatnonzero(grid.label_counts(labels)) if n > 0]
+    present = (np.flatnonzero(grid.label_counts(labels)[1:]) + 1).tolist()
     tumors = _tumor_labels(present, organ, tumors)
     middle = affine @ [*(np.array(labels.shape) / 2), 1]
     counted = among(labels, (organ, *tumors))
     _check_border(counted)
     box = grid.bounding_box(counted, affine, 2.0)
     affine = grid.moved_origin(affine, box)
-    numbered, _ = grid.components(counted[box])
-    pieces = _Pieces(labels[box], numbered, affine, organ, tumors)
+    pieces = _Pieces(labels[box], affine, organ, tumors)
     organs = _large_pieces(pieces)
-    pieces, notes, apart = _attach_tumors(pieces, organs, min_tumor_ml)
+    notes, apart = _attach_tumors(pieces, organs, min_tumor_ml)
     notes += _left_out(pieces, organs, apart, min_tumor_ml)
     chosen, note, side = _choose(pieces, organs, side, float(middle[0]), kind)
     notes += [note] if note else []
@@ -118,11 +108,8 @@ def select_labels(
 def among(labels: np.ndarray, values: Sequence[int]) -> np.ndarray:
     """``np.isin``, ten times as fast for few values."""
     mask = np.zeros_like(labels, bool)
-    flat, out = labels.ravel(order="K"), mask.ravel(order="K")
-    for start in range(0, len(flat), grid.CHUNK):
-        part = slice(start, start + grid.CHUNK)
-        for value in values:
-            out[part] |= flat[part] == value
+    for value in values:
+        mask |= labels == value
     return mask
 
 
@@ -178,40 +165,33 @@ def _large_pieces(pieces: _Pieces) -> list[int]:
 
 def _attach_tumors(
     pieces: _Pieces, organs: list[int], min_tumor_ml: float
-) -> tuple[_Pieces, list[Note], list[int]]:
-    """Join each piece with a tumor of at least ``min_tumor_ml`` to an organ within 3 mm (or one
-    voxel where voxels are larger): the gap is filled with organ where the two face each other.
-    Returns the pieces, joined ones numbered as their organ; notes; numbers of pieces farther away.
-    """
+) -> tuple[list[Note], list[int]]:
+    """Give each piece with a tumor of at least ``min_tumor_ml`` to an organ within 3 mm (or one
+    voxel where voxels are larger). Returns notes, and the pieces that lie farther away."""
     notes, apart = list[Note](), list[int]()
-    separate = [n for n in _with_tumor(pieces, min_tumor_ml) if n not in organs]
+    separate = [n for n in pieces.with_tumor(min_tumor_ml) if n not in organs]
     if len(separate) > _MOST_TUMORS:
         raise InputError(f"over {_MOST_TUMORS} tumors lie beside the organ: raise --min-tumor-ml.")
     for number in separate:
         ml = float(pieces.tumor_ml[number])
-        joined = _joined(pieces, organs, number)
-        if joined is None:
+        if (joined := _joined(pieces, organs, number)) is None:
             apart.append(number)
         else:
-            pieces, gap_mm, bridge_ml = joined
             notes.append(
-                f"a tumor of {ml:.2f} ml lies {gap_mm:.1f} mm off the organ's labels: taken as "
-                f"the organ's, the gap filled with {bridge_ml:.2f} ml of organ"
+                f"a tumor of {ml:.2f} ml lies {joined[0]:.1f} mm off the organ's labels: taken as "
+                f"the organ's, the gap filled with {joined[1]:.2f} ml of organ"
             )
-    return pieces, notes, apart
+    pieces.measure()
+    return notes, apart
 
 
-def _with_tumor(pieces: _Pieces, min_tumor_ml: float) -> list[int]:
-    return np.flatnonzero((pieces.tumor_ml > 0) & (pieces.tumor_ml >= min_tumor_ml)).tolist()
-
-
-def _joined(pieces: _Pieces, organs: list[int], number: int) -> tuple[_Pieces, float, float] | None:
-    """The pieces with piece ``number`` joined to its nearest organ, and the gap's width and filled
-    volume; None: it is too far away."""
-    affine = pieces.lps_from_index
-    spacing = spacing_mm(affine)
+def _joined(pieces: _Pieces, organs: list[int], number: int) -> tuple[float, float] | None:
+    """Join a piece to its nearest organ, with organ in the gap where the two face each other.
+    Returns the gap's width and filled volume; None: it is too far away."""
+    spacing = spacing_mm(pieces.affine)
     reach_mm = max(_GAP_MM, float(spacing.max()))
-    box = grid.bounding_box(pieces.numbers == number, affine, reach_mm + 2 * float(spacing.max()))
+    around_mm = reach_mm + 2 * float(spacing.max())
+    box = grid.bounding_box(pieces.numbers == number, pieces.affine, around_mm)
     numbers = pieces.numbers[box]
     tumor, organ = numbers == number, np.isin(numbers, organs)
     if not organ.any():
@@ -228,11 +208,9 @@ def _joined(pieces: _Pieces, organs: list[int], number: int) -> tuple[_Pieces, f
     to_tumor = ndimage.distance_transform_edt(~tumor, sampling=spacing)
     between = to_organ + to_tumor <= float(to_organ[tumor_voxel]) + float(np.median(spacing))
     bridge = between & (numbers == 0)
-    joined, labels = pieces.numbers.copy(), pieces.labels.copy()
-    joined[box][tumor | bridge] = numbers[organ_voxel]
-    labels[box][bridge] = pieces.organ
-    ml = float(bridge.sum()) * grid.voxel_ml(affine)
-    return replace(pieces, labels=labels, numbers=joined), gap_mm, ml
+    numbers[tumor | bridge] = numbers[organ_voxel]
+    pieces.labels[box][bridge] = pieces.organ
+    return gap_mm, float(bridge.sum()) * grid.voxel_ml(pieces.affine)
 
 
 def _left_out(
@@ -246,7 +224,7 @@ def _left_out(
     notes: list[Note] = [Finding("dropped", {"what": what, "ml": ml}) for ml in large_ml.tolist()]
     if count := int((specks_ml > 0).sum()):
         notes.append(f"{count} specks beside the organ dropped ({specks_ml.sum():.2f} ml together)")
-    if apart and not set(organs) & set(_with_tumor(pieces, min_tumor_ml)):
+    if apart and not set(organs) & set(pieces.with_tumor(min_tumor_ml)):
         text = " and ".join(f"{pieces.tumor_ml[n]:.1f} ml" for n in apart[:5])
         raise InputError(
             f"the only tumor ({text}) lies more than {_GAP_MM:g} mm from the organ. Check the "
@@ -283,9 +261,8 @@ def _choose(
         side = "left" if x_mm[best] > middle_x_mm else "right"
         note = f"the patient's {side} {kind.words} was chosen: it bears most tumor"
         return best, note, side if left_mm - right_mm > _PAIR_APART_MM else UNKNOWN
-    sign = 1 if side == "left" else -1
     # With one organ only the image's midline is known: near it, trust the user.
-    slack = _MIDLINE_MARGIN_MM if alone else 0.0
+    slack, sign = _MIDLINE_MARGIN_MM if alone else 0.0, 1 if side == "left" else -1
     fitting = [n for n in organs if sign * (x_mm[n] - middle_x_mm) > -slack]
     if not fitting:
         raise InputError(f"the {kind.words} lies on the patient's other side. Check --side.")
@@ -328,9 +305,7 @@ def _number_tumors(
 
 
 def neighbours(
-    labels: UInt8[np.ndarray, "i j k"],
-    chosen: UInt8[np.ndarray, "i j k"],
-    used: tuple[int, ...],
+    labels: UInt8[np.ndarray, "i j k"], chosen: UInt8[np.ndarray, "i j k"], used: tuple[int, ...]
 ) -> dict[int, float]:
     """Labels of a map that touch what was ``chosen`` of it, on the same grid, and are not ``used``:
     by label, the share of its surface that lies on what is used. A tumor inside has 1."""

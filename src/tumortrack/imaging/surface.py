@@ -23,10 +23,8 @@ _LARGE_MM3 = 8e5  # of an organ that needs no grid as fine as 1.5 mm
 _BLUR_VOXELS = 0.9  # enough to remove steps of one voxel, too little to lose a small tumor
 _STEPS_ACROSS = 14  # cells across the thinnest extent of a small part
 _MOST_MARCHES = 16  # 2 to 4 suffice where the volume is a smooth function of the level
-_REPORTED = (
-    *("labels_ml", "mesh_ml", "change_percent"),
-    *("distance_mean_voxels", "distance_95_voxels", "distance_max_voxels"),
-)
+_REPORTED = ["labels_ml", "mesh_ml", "change_percent"]
+_REPORTED += ["distance_mean_voxels", "distance_95_voxels", "distance_max_voxels"]
 
 
 def surfaces(
@@ -52,12 +50,10 @@ def surfaces(
     for name, mask in zip(names, masks, strict=True):
         if not mask.any():
             raise InputError(f"the labels have no voxel of {name}; number the tumors without gap.")
-        mesh = surface_of(name, mask, affine, step, dropped_mm3=dropped_mm3)
-        ml, mesh_ml = float(mask.sum()) * voxel_ml(affine), mesh.volume_ml
-        distance = _boundary_distance(mesh, mask, affine)
-        p95 = np.percentile(distance, 95)
-        rows.append((ml, mesh_ml, 100 * (mesh_ml / ml - 1), distance.mean(), p95, distance.max()))
-        parts.append(mesh)
+        parts.append(mesh := surface_of(name, mask, affine, step, dropped_mm3=dropped_mm3))
+        ml, distance = float(mask.sum()) * voxel_ml(affine), _boundary_distance(mesh, mask, affine)
+        figures = distance.mean(), np.percentile(distance, 95), distance.max()
+        rows.append((ml, mesh.volume_ml, 100 * (mesh.volume_ml / ml - 1), *figures))
     columns = [[round(float(x), 4) for x in column] for column in zip(*rows, strict=True)]
     report: dict[str, list[Any]] = {
         "names": list(names),

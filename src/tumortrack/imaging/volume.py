@@ -159,21 +159,24 @@ def read_several(files: Sequence[Path]) -> grid.RawVolume:
     first = read_raw(files[0])
 
     def mask(file: Path) -> np.ndarray:
-        volume = labels_of(read_raw(file), file)
-        labels, affine = volume.labels, volume.lps_from_index
-        same = labels.shape == first.array.shape
-        if not same or not np.allclose(affine, first.lps_from_index, atol=_SAME_MM):
+        raw = read_raw(file)
+        labels = labels_of(raw, file).labels
+        if not same_grid(raw, first):
             raise InputError(f"{file} has another grid than {files[0]}. Export both on the same.")
         if len(found := np.unique(labels)) > 2 or found[0] != 0:
             raise InputError(f"{file} has labels {found[:9].tolist()}. Give a label map alone.")
         return labels > 0
 
-    names = [stem(file) for file in files]
     segments = tuple(
-        grid.Segment(n, name, partial(mask, file))
-        for n, (name, file) in enumerate(zip(names, files, strict=True), 1)
+        grid.Segment(n, stem(file), partial(mask, file)) for n, file in enumerate(files, 1)
     )
     return grid.RawVolume(first.array, first.lps_from_index, segments=segments)
+
+
+def same_grid(a: grid.RawVolume, b: grid.RawVolume) -> bool:
+    return a.array.shape == b.array.shape and np.allclose(
+        a.lps_from_index, b.lps_from_index, atol=_SAME_MM
+    )
 
 
 def is_label_map(raw: grid.RawVolume, most: int = MOST_LABELS) -> bool:
@@ -236,13 +239,9 @@ def _segments(path: Path, fields: dict[str, str], layers: np.ndarray) -> tuple[g
         raise InputError(f"{path} has {len(found)} segments; at most 255 are read.")
     own = len(set(values)) == len(values) and all(0 < value < 256 for value in values)
     return tuple(
-        grid.Segment(place[1] if own else n, name, partial(_equal, layers[place[0]], place[1]))
-        for n, (place, name) in enumerate(found.items(), 1)
+        grid.Segment(value if own else n, name, partial(np.equal, layers[layer], value))
+        for n, ((layer, value), name) in enumerate(found.items(), 1)
     )
-
-
-def _equal(array: np.ndarray, value: int) -> np.ndarray:
-    return array == value
 
 
 def _header(path: Path) -> tuple[dict[str, str], int]:

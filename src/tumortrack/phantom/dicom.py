@@ -31,12 +31,10 @@ def write_dicom_series(
     description: str = "Hydrogel kidney phantom",
     side: Side = UNKNOWN,
 ) -> None:
-    """Write a CT Image Storage series, one uncompressed file per slice (third array axis).
-
-    UIDs are derived from the volume and the seed. File names are in random order, so that readers
-    must sort by ImagePositionPatient. Exposure as in the paper (90 kV, 13.6 mA). ``side`` is
-    written as Laterality. Raises InputError: ``folder`` exists; HU not finite or outside
-    -1024..64511; sheared voxels. Raises StorageError: writing failed; nothing is left behind."""
+    """Write a CT Image Storage series, one uncompressed file per slice (third array axis), in
+    random order of names. UIDs are derived from the volume and the seed. ``side`` is written as
+    Laterality. Raises InputError: ``folder`` exists; HU not finite or outside -1024..64511; sheared
+    voxels. Raises StorageError: writing failed; nothing is left behind."""
     load_pydicom()
     from pydicom import dcmwrite
 
@@ -44,9 +42,7 @@ def write_dicom_series(
         raise InputError(f"HU must be finite and within {_INTERCEPT}..{_HIGHEST_HU} for DICOM.")
     directions = volume.lps_from_index[:3, :3] / spacing_mm(volume.lps_from_index)
     if not np.allclose(directions.T @ directions, np.eye(3), atol=1e-4):
-        raise InputError(
-            "the volume's axes are not perpendicular, as DICOM needs. Resample it first."
-        )
+        raise InputError("the volume's axes are not perpendicular. Resample it for DICOM.")
     digest = hashlib.sha256(volume.hu.tobytes() + volume.lps_from_index.tobytes()).hexdigest()
     entropy = [digest, str(seed), description]
     names = np.random.default_rng(seed).permutation(volume.hu.shape[2])

@@ -41,6 +41,11 @@ class TumorParameters(Config, frozen=True):
         self.check_between("tumor:", diameter_mm=(2, 120), lobulation=(0, 0.2))
         self.check_between("tumor:", center_mm=(-200, 200))
 
+    @property
+    def radius_mm(self) -> float:
+        """The largest."""
+        return self.diameter_mm / 2 * (1 + self.lobulation)
+
 
 class PhantomParameters(Config, frozen=True):
     """The shape; by default the paper's phantom."""
@@ -81,12 +86,11 @@ def phantom_labels(parameters: PhantomParameters, voxel_mm: float = 0.8) -> Labe
     tumor wholly outside the organ."""
     if not 0.2 <= voxel_mm <= 4:
         raise InputError(f"voxel size {voxel_mm} mm: allowed are 0.2 to 4 mm.")
-    reach_mm = np.array(parameters.size_mm) / 2
-    lower_mm, upper_mm = -reach_mm, reach_mm
+    upper_mm = np.array(parameters.size_mm) / 2
+    lower_mm = -upper_mm
     for tumor in parameters.tumors:
-        radius_mm = tumor.diameter_mm / 2 * (1 + tumor.lobulation)
-        lower_mm = np.minimum(lower_mm, np.array(tumor.center_mm) - radius_mm)
-        upper_mm = np.maximum(upper_mm, np.array(tumor.center_mm) + radius_mm)
+        lower_mm = np.minimum(lower_mm, np.array(tumor.center_mm) - tumor.radius_mm)
+        upper_mm = np.maximum(upper_mm, np.array(tumor.center_mm) + tumor.radius_mm)
     counts = np.ceil((upper_mm - lower_mm + 8) / voxel_mm).astype(int) + 1
     if counts.prod() > _LARGEST_GRID:
         raise InputError(
@@ -116,8 +120,8 @@ def phantom_labels(parameters: PhantomParameters, voxel_mm: float = 0.8) -> Labe
 
 def gap_mm(a: TumorParameters, b: TumorParameters) -> float:
     """A lower bound of the distance between two tumors' surfaces."""
-    radii_mm = [tumor.diameter_mm / 2 * (1 + tumor.lobulation) for tumor in (a, b)]
-    return float(np.linalg.norm(np.subtract(a.center_mm, b.center_mm)) - sum(radii_mm))
+    apart_mm = np.linalg.norm(np.subtract(a.center_mm, b.center_mm))
+    return float(apart_mm - (a.radius_mm + b.radius_mm))
 
 
 def organ_field(parameters: PhantomParameters, axes_mm: Axes) -> Float[np.ndarray, "i j k"]:
@@ -130,21 +134,14 @@ def organ_field(parameters: PhantomParameters, axes_mm: Axes) -> Float[np.ndarra
     # Bending, hilum and lumps change the box: scale each axis so that it has the stated size.
     for axis, length_mm in enumerate(parameters.size_mm):
         others = tuple(other for other in range(3) if other != axis)
-        low, high = _crossings(unscaled[axis], field.min(axis=others))
-        scale = (high - low) / length_mm
-        scaled.append(np.asarray(axes_mm[axis]) * scale + (low + high) / 2)
+        nearest, at_mm, ends = field.min(axis=others), unscaled[axis], []
+        inside = np.flatnonzero(nearest < 0)
+        for inner, outer in ((inside[0], inside[0] - 1), (inside[-1], inside[-1] + 1)):
+            t = nearest[inner] / (nearest[inner] - nearest[outer])
+            ends.append(float(at_mm[inner] + t * (at_mm[outer] - at_mm[inner])))
+        scaled.append(np.asarray(axes_mm[axis]) * (np.diff(ends)[0] / length_mm) + sum(ends) / 2)
     x, y, z = scaled
     return _unscaled_field(parameters, (x, y, z))
-
-
-def _crossings(axis_mm: np.ndarray, values: np.ndarray) -> tuple[float, float]:
-    """The first and the last zero of ``values``, by linear interpolation."""
-    inside = np.flatnonzero(values < 0)
-    ends = []
-    for inner, outer in ((inside[0], inside[0] - 1), (inside[-1], inside[-1] + 1)):
-        t = values[inner] / (values[inner] - values[outer])
-        ends.append(float(axis_mm[inner] + t * (axis_mm[outer] - axis_mm[inner])))
-    return ends[0], ends[1]
 
 
 def _unscaled_field(parameters: PhantomParameters, axes_mm: Axes) -> Float[np.ndarray, "i j k"]:

@@ -7,15 +7,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float32
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import rigid, spacing_mm
-from tumortrack.core.types import FIRST_TUMOR, ORGAN, LabelVolume, Volume
+from tumortrack.core.geometry import rigid, spacing_mm, transform_points
+from tumortrack.core.types import ORGAN, LabelVolume, Volume
 
 AIR_HU = -1000.0
 _LOWEST_HU, _HIGHEST_HU = -1024, 3071  # the 12 bits of a clinical scanner
@@ -27,12 +27,9 @@ _Object = tuple[np.ndarray, np.ndarray, float]  # lower and upper corner, HU
 class ScannerParameters(Config, frozen=True):
     """Materials, objects next to the phantom, and the scanner's resolution and noise.
 
-    Sources of the HU. Organ: 10 % PVA hydrogel attenuates like soft tissue (Price et al. 2010,
-    doi 10.1088/0031-9155/55/4/018); 40 HU is our choice. Tumors: 2.27 % BaSO4 by weight is about
-    13 mg barium per ml; with the attenuation of barium and water at 60 keV (8.5 and 0.206 cm2/g,
-    NIST XCOM) it adds some 550 HU. Block: polyoxymethylene, about 340 HU (as the Delrin rod of the
-    Catphan phantom), intentionally inside the tumor window.
-    """
+    Organ: 10 % PVA hydrogel, like soft tissue (doi 10.1088/0031-9155/55/4/018). Tumors: 2.27 %
+    BaSO4 by weight, which adds some 550 HU (NIST XCOM at 60 keV). Block: polyoxymethylene,
+    intentionally inside the tumor window."""
 
     organ_hu: float = 40.0
     tumor_hu: float = 570.0
@@ -74,16 +71,15 @@ def scan(
     ``material_hu`` overrides them by label. HU are whole numbers in -1024..3071; the same seed
     gives the same volume. Raises InputError: an empty map, or more than 400 million voxels."""
     body = _crop(labels)
-    # Box of the voxel centres in LPS
-    ends = np.stack(np.meshgrid(*[(0, n - 1) for n in body.labels.shape]), -1).reshape(-1, 3)
-    corners = ends @ body.lps_from_index[:3, :3].T + body.lps_from_index[:3, 3]
-    box_mm = np.stack([corners.min(0), corners.max(0)])
+    ends = np.indices((2, 2, 2)).reshape(3, -1).T * (np.array(body.labels.shape) - 1.0)
+    corners = transform_points(body.lps_from_index, ends)
+    box_mm = np.stack([corners.min(0), corners.max(0)])  # of voxel centres
     objects = _objects(box_mm, parameters)
     lps_from_index, shape = _field_of_view(box_mm, objects, parameters)
     sigma_mm = _blur_mm(np.eye(3), lps_from_index, parameters)
     hu = _scan_labels(body, lps_from_index, shape, parameters, material_hu or {})
-    for lower_mm, upper_mm, object_hu in objects:
-        _add_box(hu, lps_from_index, (lower_mm, upper_mm), object_hu - AIR_HU, sigma_mm)
+    for box in objects:
+        _add_box(hu, lps_from_index, box, sigma_mm)
     hu += _noise(shape, parameters, seed)
     return Volume(np.clip(np.rint(hu), _LOWEST_HU, _HIGHEST_HU), lps_from_index)
 
@@ -100,9 +96,8 @@ def _crop(labels: LabelVolume) -> LabelVolume:
 
 def _objects(box_mm: np.ndarray, parameters: ScannerParameters) -> list[_Object]:
     """Table and block as (lower, upper, HU) boxes along the LPS axes."""
-    objects = []
+    objects, block = [], np.array(parameters.block_size_mm)
     lower, upper = box_mm.copy()
-    block = np.array(parameters.block_size_mm)
     if block.min() > 0:
         # It stands on the pad next to the phantom, a little towards the feet.
         right_mm, middle_mm = lower[0] - parameters.block_gap_mm, box_mm.mean(0)[2]
@@ -139,7 +134,7 @@ def _field_of_view(
 
 def _blur_mm(
     axes: np.ndarray, lps_from_index: np.ndarray, parameters: ScannerParameters
-) -> Float[np.ndarray, " 3"]:
+) -> np.ndarray:
     """Standard deviation of the blur along three directions (columns, LPS): point spread, and
     averaging over a voxel, which has the variance h^2/12."""
     voxel = ((axes.T @ lps_from_index[:3, :3]) ** 2).sum(1) / 12
@@ -154,43 +149,31 @@ def _scan_labels(
     material_hu: Mapping[int, float],
 ) -> Float32[np.ndarray, "i j k"]:
     """The label map's HU, blurred on its own grid and resampled to the scanner's."""
-    hu_of_label = np.full(256, AIR_HU, np.float32)
-    hu_of_label[ORGAN] = parameters.organ_hu
-    hu_of_label[FIRST_TUMOR:] = parameters.tumor_hu
-    for label, hu in material_hu.items():
-        hu_of_label[label] = hu
+    hu_of_label = np.full(256, parameters.tumor_hu, np.float32)
+    hu_of_label[[0, ORGAN, *material_hu]] = [AIR_HU, parameters.organ_hu, *material_hu.values()]
     spacing = spacing_mm(body.lps_from_index)
     directions = body.lps_from_index[:3, :3] / spacing
     sigma = _blur_mm(directions, lps_from_index, parameters) / spacing
     pad = int(np.ceil(4 * sigma.max())) + 1
     padded = np.pad(hu_of_label[body.labels], pad, constant_values=AIR_HU)
     body_from_index = np.linalg.inv(body.lps_from_index) @ lps_from_index
+    blurred = ndimage.gaussian_filter(padded, sigma, mode="nearest")
+    matrix, offset = body_from_index[:3, :3], body_from_index[:3, 3] + pad
     return ndimage.affine_transform(
-        ndimage.gaussian_filter(padded, sigma, mode="nearest"),
-        body_from_index[:3, :3],
-        body_from_index[:3, 3] + pad,
-        output_shape=shape,
-        output=np.float32,
-        order=1,
-        mode="constant",
-        cval=AIR_HU,
+        blurred, matrix, offset, shape, np.float32, order=1, mode="constant", cval=AIR_HU
     )
 
 
 def _add_box(
-    hu: np.ndarray,
-    lps_from_index: np.ndarray,
-    corners_mm: tuple[np.ndarray, np.ndarray],
-    contrast_hu: float,
-    sigma_mm: np.ndarray,
+    hu: np.ndarray, lps_from_index: np.ndarray, box: _Object, sigma_mm: np.ndarray
 ) -> None:
     """Add a box along the LPS axes, blurred exactly: a product of three error functions."""
-    lower, upper = (np.asarray(c, np.float32) for c in corners_mm)
+    lower, upper = (np.asarray(corner, np.float32) for corner in box[:2])
     sigma = np.maximum(sigma_mm, 1e-6).astype(np.float32)
     i, j = (np.arange(n, dtype=np.float32) for n in hu.shape[:2])
     a = lps_from_index.astype(np.float32)
     for k in range(hu.shape[2]):
-        share = np.full(hu.shape[:2], contrast_hu, np.float32)
+        share = np.full(hu.shape[:2], box[2] - AIR_HU, np.float32)
         for axis in range(3):
             at = a[axis, 0] * i[:, None] + a[axis, 1] * j + (a[axis, 2] * k + a[axis, 3])
             share *= ndtr((at - lower[axis]) / sigma[axis]) - ndtr((at - upper[axis]) / sigma[axis])
