@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Unpack
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -25,6 +25,15 @@ from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
 from tumortrack.imaging.case import Case
 from tumortrack.imaging.case import load_case as load_case
+from tumortrack.tracking.keywords import (
+    ExportKeywords,
+    LocateKeywords,
+    PrepareKeywords,
+    SessionKeywords,
+    SimulateKeywords,
+    StrPath,
+    TrackKeywords,
+)
 from tumortrack.tracking.options import (
     Device,
     ExportOptions,
@@ -44,7 +53,6 @@ if TYPE_CHECKING:
     from tumortrack.simulate.scene_folder import Scene
     from tumortrack.tracking.tracker import Tracker
 
-StrPath = str | Path
 _QC = "qc.png"
 
 
@@ -52,11 +60,7 @@ def scan_phantom(
     folder: StrPath, seed: int = 1, spacing_mm: tuple[float, float, float] = (1.2, 1.2, 1.5)
 ) -> Path:
     """Write a virtual CT of the built-in kidney phantom as a DICOM series, if none is there;
-    returns the folder, which ``prepare`` reads.
-
-    Raises:
-        StorageError: the disk refused.
-    """
+    returns the folder, which ``prepare`` reads."""
     from tumortrack.phantom import dicom, digital, scanner
 
     folder = Path(folder)
@@ -75,29 +79,19 @@ def prepare(
     overwrite: bool = False,
     segment: str | None = None,
     progress: Callable[[int, int], None] | None = None,
-    **options: Any,
+    **options: Unpack[PrepareKeywords],
 ) -> Case:
-    """A case from a DICOM folder, a CT volume, a label map or segmentation, a folder of meshes or
-    of label files with one structure each.
+    """A case (CT frame, mm) from a DICOM folder, a CT volume, a label map or segmentation, a folder
+    of meshes or of label files with one structure each. Raises InputError: the source or an option
+    cannot be used.
 
     Args:
         source: one, or several mesh or label files.
         folder: where to write the case with a picture to check it by (qc.png); None: nowhere.
         overwrite: replace a case that lies there.
-        segment: of a CT: what segments it, as ``prepare --segment``; its label map is kept beside
-            ``folder`` (FOLDER.labels.nii.gz).
+        segment: of a CT: what segments it, as `prepare --segment`; FOLDER.labels.nii.gz is kept.
         progress: of making the case's model, as its last step: steps done, of how many.
-        options: as on the command line: ``name``, ``term``,
-            ``structure``, ``organ_hu``, ``tumor_hu``, ``labels``, ``side``, ``organ``,
-            ``tumor``, ``up``, ``rotations``, ``tilt``, ``sensor``, ``series``,
-            ``unit``, ``min_tumor_ml``, ``patient``, ``ct``.
-
-    Returns:
-        The case: anatomy as closed surfaces, labels and CT; CT frame, mm.
-
-    Raises:
-        InputError: the source cannot be used, or an option is unknown or not allowed.
-        StorageError: the disk refused.
+        options: as `tumortrack prepare --help` explains them.
     """
     from tumortrack.imaging import prepare as preparing
     from tumortrack.imaging.case import KIND, save_case
@@ -105,7 +99,7 @@ def prepare(
     from tumortrack.models.folder import weakness_of
     from tumortrack.tracking.model_files import case_model
 
-    asked = options_from(PrepareOptions, options, "prepare")
+    asked = options_from(PrepareOptions, {**options}, "prepare")
     given = [source] if isinstance(source, str | Path) else source
     sources = [Path(each) for each in given]
     if folder is not None:
@@ -190,26 +184,21 @@ def write_scenes(
     folder: StrPath,
     *,
     progress: Callable[[], None] | None = None,
-    **options: Any,
+    **options: Unpack[SimulateKeywords],
 ) -> None:
     """Write deformed scenes of a case with their truth, as `tumortrack simulate` does: what
-    ``evaluate`` reads. Scenes that are there stay.
+    ``evaluate`` reads. Raises InputError: an option is not allowed, or a scene that is there was
+    made otherwise.
 
     Args:
         case: folder that ``prepare`` wrote.
-        folder: where to write scene folders 0000, 0001, ...
+        folder: where to write scene folders 0000, 0001, ...; those that are there stay.
         progress: called after each scene.
-        options: as on the command line: ``scenes``, ``seed``, ``configuration``, ``falloff``,
-            ``rotations``, ``squeeze``, ``noise``, ``sensor``, ``uncalibrated``, ``tissue``,
-            ``elastic``.
-
-    Raises:
-        InputError: an option is not allowed, or a scene that is there was made otherwise.
-        StorageError: the disk refused.
+        options: as `tumortrack simulate --help` explains them.
     """
     from tumortrack.simulate import dataset
 
-    asked = options_from(SimulateOptions, options, "write_scenes")
+    asked = options_from(SimulateOptions, {**options}, "write_scenes")
     made_of = load_case(case)
     inside = Path(folder).iterdir() if Path(folder).is_dir() else ()
     if strays := [p.name for p in inside if p.name[0] != "." and not (p / "meta.json").is_file()]:
@@ -224,24 +213,18 @@ def write_scenes(
             progress()
 
 
-def export(case: StrPath, folder: StrPath, **options: Any) -> tuple[str, ...]:
-    """Write a case, or what was located, as a scene for 3D Slicer, and a CT's as DICOM, as
-    `tumortrack export` does.
+def export(case: StrPath, folder: StrPath, **options: Unpack[ExportKeywords]) -> tuple[str, ...]:
+    """Write a case, or what was located, as a scene for 3D Slicer, and a CT's as DICOM; returns what
+    to know of the DICOM file. Raises InputError, ArtifactError: folders or options that do not fit
+    each other, or cannot be used.
 
     Args:
         case: folder that ``prepare`` wrote, or alone one that ``locate`` wrote.
-        options: as on the command line: ``located``, ``live``, ``dicom``, ``series``, ``patient``.
-
-    Returns:
-        What to know of the DICOM file.
-
-    Raises:
-        InputError, ArtifactError: folders or options that do not fit each other, or cannot be used.
-        StorageError: the disk refused.
+        options: as `tumortrack export --help` explains them.
     """
     from tumortrack.report import slicer_scene
 
-    asked = options_from(ExportOptions, options, "export")
+    asked = options_from(ExportOptions, {**options}, "export")
     return slicer_scene.export(Path(case), Path(folder), asked)
 
 
@@ -263,7 +246,9 @@ def train(
     progress: Callable[[int, int], None] | None = None,
 ) -> Model:
     """A model of its own folder. The default preset, ``clinic``, has nothing to learn: a case holds
-    its model. For ``quick`` and ``paper`` the same call resumes after Ctrl-C or a crash.
+    its model. For ``quick`` and ``paper`` (of tumortrack-occupancy) the same call resumes after
+    Ctrl-C or a crash. Raises InputError, ArtifactError: no case, an option is not allowed, a part is
+    too small to be learnt, or ``folder`` holds another model or run.
 
     Args:
         case: or the folder that ``prepare`` wrote.
@@ -279,12 +264,6 @@ def train(
         checkpoint_every_s: a crash loses at most the steps since.
         report: of a training: called every few seconds.
         progress: of making a model that learns nothing: steps done, of how many.
-
-    Raises:
-        InputError: an option is not allowed, a part is too small to be learnt.
-        PackageError: ``quick`` and ``paper``, without tumortrack-occupancy.
-        InputError, ArtifactError: no case, or ``folder`` holds another model or run.
-        StorageError: the disk is full; the last checkpoint is whole.
     """
     from tumortrack.models.folder import check_trainable
     from tumortrack.models.method import TrainOptions, method_of_config, method_of_preset
@@ -293,7 +272,10 @@ def train(
     from tumortrack.tracking.presets import PRESETS, seen_by
 
     if minutes is not None and steps is not None:
-        raise InputError("minutes and steps both say when to stop; give one of them.")
+        raise InputError("--minutes and --steps both say when to stop; give one of them.")
+    for name, value in (("minutes", minutes), ("steps", steps), ("workers", workers)):
+        if value is not None and not value >= 0:
+            raise InputError(f"--{name} {value} must be 0 or more.")
     if preset not in PRESETS:
         raise InputError(f"there is no preset {preset!r}; allowed: {', '.join(PRESETS)}.")
     if config is not None and (rotations or sensor):
@@ -320,24 +302,16 @@ def train(
 
 def load_model(folder: StrPath, device: Device = "auto") -> Model:
     """Read a folder that ``train`` wrote, or the model of a case; ``Tracker(model)`` locates with
-    it.
-
-    Raises:
-        ArtifactError: missing, unfinished, of another schema, damaged or changed.
-        InputError: CUDA was asked for and is not available.
-        PackageError: the method that made it is not installed.
-    """
+    it. Raises ArtifactError: missing, unfinished, of another schema, damaged or changed;
+    PackageError: the method that made it is not installed."""
     from tumortrack.tracking import model_files
 
     return model_files.load_model(Path(folder), device)
 
 
 def read_cloud(path: StrPath, unit: Literal["mm", "m"] = "mm") -> SensorCloud:
-    """A cloud in the camera frame from .ply, .pcd or .npz; what was dropped is a warning.
-
-    Raises:
-        InputError: missing, damaged, of another kind, in metres, or without any point.
-    """
+    """A cloud in the camera frame from .ply, .pcd or .npz; what was dropped is a warning. Raises
+    InputError: missing, damaged, of another kind, in metres, or without any point."""
     from tumortrack.sense import files
     from tumortrack.sense.cloud import check_cloud
 
@@ -349,15 +323,13 @@ def read_cloud(path: StrPath, unit: Literal["mm", "m"] = "mm") -> SensorCloud:
 
 
 def read_depth(path: StrPath, intrinsics: StrPath, unit_mm: float | None = None) -> DepthFrame:
-    """A depth image: 16-bit PNG or TIFF, or a TIFF of floats; 0 is no return.
+    """A depth image: 16-bit PNG or TIFF, or a TIFF of floats; 0 is no return. Raises InputError:
+    missing, damaged, of another kind or size.
 
     Args:
         intrinsics: JSON with width, height, fx, fy, cx, cy in pixels.
         unit_mm: of one step. Default: what that file says (depth_unit_mm), else 0.1 (a D405's), of
             floats 1000 (metres). Many cameras have 1.
-
-    Raises:
-        InputError: missing, damaged, of another kind or size.
     """
     from tumortrack.sense import files
 
@@ -419,34 +391,29 @@ def teach(
     beside: Sequence[tuple[int, int]],
 ) -> TissueClassifier:
     """What the organ looks like in colour and depth, from pixels (row, column) on it and beside it,
-    two of each at least; for ``find_organ``.
-
-    Raises:
-        InputError: a pixel shows too little, or organ and surroundings look alike.
-    """
+    two of each at least; for ``find_organ``. Raises InputError: a pixel shows too little, or organ
+    and surroundings look alike."""
     from tumortrack.sense.region import tissue
 
     pixels = [(pixel, True) for pixel in organ] + [(pixel, False) for pixel in beside]
     return tissue.teach([tissue.sample_click(frame, picture, *pixel) for pixel in pixels])
 
 
-def locate(model: StrPath, clouds: StrPath | Sequence[StrPath], **options: Any) -> Located:
+def locate(
+    model: StrPath, clouds: StrPath | Sequence[StrPath], **options: Unpack[LocateKeywords]
+) -> Located:
     """Locate organ and tumors in the file of a cloud or depth image, or in those of several views
     of the organ at rest, as `tumortrack locate` does; ``Tracker.locate`` takes clouds in memory.
+    Raises InputError, ArtifactError: a file or an option cannot be used, or the model is another
+    patient's than stated.
 
     Args:
         model: folder of a case, or that ``train`` wrote.
-        options: as on the command line: ``range``, ``box``, ``whole``, ``depth_error``, ``at``,
-            ``mask``, ``poses``, ``intrinsics`` (one for each view), ``depth_unit``, ``unit``,
-            ``grid``, ``seed``, ``evidence``, ``map``, ``case``, ``patient``, ``side``, ``device``.
+        options: as `tumortrack locate --help` explains them; ``intrinsics``: one for each view.
 
     Returns:
         ``estimate``, which is None where nothing could be located; ``report``, as in report.json;
         ``save(folder, overwrite)`` writes all.
-
-    Raises:
-        InputError, ArtifactError: a file or an option cannot be used, or the model is another
-            patient's than ``patient`` and ``side`` state.
     """
     from tumortrack.report.locating import locate as locate_files
 
@@ -456,7 +423,7 @@ def locate(model: StrPath, clouds: StrPath | Sequence[StrPath], **options: Any) 
             "locate(FOLDER, FILE), or Tracker(load_case(FOLDER)).locate(cloud)."
         )
     files = [clouds] if isinstance(clouds, str | Path) else clouds
-    asked = options_from(LocateOptions, options, "locate")
+    asked = options_from(LocateOptions, {**options}, "locate")
     return locate_files(Path(model), [Path(file) for file in files], asked)
 
 
@@ -469,15 +436,12 @@ def save_estimate(
     seen: DepthFrame | SensorCloud | None = None,
 ) -> None:
     """Write what `tumortrack locate` writes: points, labelled volume, surfaces, report, and a page
-    to look at (index.html, picture.png); camera frame, mm.
+    to look at (index.html, picture.png); camera frame, mm. Raises InputError: the folder exists and
+    ``overwrite`` is False.
 
     Args:
         cloud: the organ's points, in which it was located, for the page.
         seen: all that the camera saw, likewise.
-
-    Raises:
-        InputError: the folder exists and ``overwrite`` is False.
-        StorageError: the disk refused.
     """
     from tumortrack.report.locating import Located
     from tumortrack.report.seen import Seen
@@ -487,11 +451,8 @@ def save_estimate(
 
 def load_estimate(folder: StrPath) -> Estimate:
     """Read a folder that ``save_estimate`` or `tumortrack locate` wrote; its ``motion`` is None:
-    only the model knows that.
-
-    Raises:
-        ArtifactError: no such folder, damaged or changed, or nothing was located in it.
-    """
+    only the model knows that. Raises ArtifactError: no such folder, damaged or changed, or nothing
+    was located in it."""
     from tumortrack.tracking.files import read_estimate
 
     return read_estimate(Path(folder))
@@ -519,7 +480,9 @@ def evaluate(
     device: Device = "auto",
     progress: Callable[[], None] | None = None,
 ) -> dict[str, Any]:
-    """Locate in every scene and compare with the truth.
+    """Locate in every scene and compare with the truth. Raises InputError: no scenes, one that
+    cannot be read or is of another case than the model, or the folder exists and ``overwrite`` is
+    False.
 
     Args:
         locate: a tracker, the folder of a case or model, or any function from an observed cloud to
@@ -537,13 +500,8 @@ def evaluate(
         target errors, and for a tracker of a `clinic` model those of the best rigid pose and of a
         rigid fit; ``summary`` has medians, and the worst with its scene. docs/conventions.md
         defines each.
-
-    Raises:
-        InputError: no scenes, or a scene that cannot be read, or of another case than the model;
-            the folder exists and ``overwrite`` is False.
     """
     from tumortrack.report import protocol
-    from tumortrack.report.place import check_place
     from tumortrack.report.rivals import rivals_of
     from tumortrack.report.summary import summarise
     from tumortrack.tracking.tracker import Tracker
@@ -558,15 +516,14 @@ def evaluate(
     if isinstance(scenes, str | Path):
         if report is None:
             raise InputError("evaluating a folder of scenes writes a report: say where.")
-        folder, out, progress = Path(scenes), Path(report), progress or (lambda: None)
-        check_place(out, overwrite)
+        folder, out, step = Path(scenes), Path(report), progress or (lambda: None)
+        protocol.check_place(out, overwrite)
         if isinstance(locate, Path | Tracker):
-            return protocol.evaluate_model(
-                locate, folder, out, protocol.Asked(grid, seed, device), progress
-            )
+            return protocol.evaluate_model(locate, folder, out, grid, seed, device, step)
         call: Any = getattr(locate, "locate", locate)
-        rivals = rivals_of(getattr(locate, "model", None))
-        return protocol.evaluate_scenes(call, folder, out, progress, rivals=rivals)
+        return protocol.evaluate_scenes(
+            call, folder, out, step, rivals=rivals_of(getattr(locate, "model", None))
+        )
     if not scenes:
         raise InputError("there are no scenes to evaluate: simulate_scenes(case, 20) makes some.")
     if isinstance(locate, Path):
@@ -587,9 +544,10 @@ def track(
     until: Callable[[TrackingResult], bool] | None = None,
     seconds: float = 0.0,
     range_mm: tuple[float, float] | None = None,
-    **options: Any,
+    **options: Unpack[TrackKeywords],
 ) -> dict[str, Any]:
-    """Follow the organ live, from a source to sinks, until the source ends.
+    """Follow the organ live, from a source to sinks, until the source ends; returns the run's
+    figures: counts, latencies, stage times (docs/conventions.md).
 
     Args:
         tracker: or the folder of a case or model.
@@ -599,18 +557,10 @@ def track(
         until: called with every result; True ends the loop.
         seconds: end so many s after the first frame; 0: not.
         range_mm: depths to keep (default: those of the model's scenes).
-        options: as on the command line: ``box``, ``whole``, ``depth_error``, ``intrinsics``,
-            ``frame``, ``views``, ``poses``, ``moving``, ``tool``, ``scan``, ``smoothing``,
-            ``rescan``, ``stale``, ``frozen``, ``give_up``, ``report``, ``seed``, ``patient``,
-            ``side``, ``device``.
-
-    Returns:
-        The run's figures: counts, latencies, stage times (docs/conventions.md).
+        options: as `tumortrack track --help` explains them.
 
     Raises:
-        InputError: an option, or a source or sink that is not written as it must be, or cannot
-            work.
-        StorageError: a sink cannot write.
+        InputError: an option, a source or a sink is not written as it must be, or cannot work.
         SourceLost: no frame came for a minute.
     """
     run = session(tracker, source, sinks, seconds=seconds, range=range_mm, **options)
@@ -633,12 +583,12 @@ def session(
     source: Any,
     sinks: Sequence[Any] = (),
     arms: Arms | None = None,
-    **options: Any,
+    **options: Unpack[SessionKeywords],
 ) -> Session:
     """``track``, ready to be opened: for programs that show what happens meanwhile, as the command
     does. ``arms`` act on what is tracked."""
     from tumortrack.live.session import session
 
-    asked = options_from(TrackOptions, options, "track")
+    asked = options_from(TrackOptions, {**options}, "track")
     model = Path(tracker) if isinstance(tracker, str | Path) else tracker
     return session(model, source, sinks, asked, arms)

@@ -24,8 +24,6 @@ def test_it_finds_everything_on_one_screen_also_where_the_system_tells_no_affini
     said = capsys.readouterr().out
     assert int(re.search(r"cores: (\d+)", said).group(1)) >= 1
     assert "BROKEN" not in said
-    assert "rosbags 0.1" in said
-    assert "compiled kernels, in" in said
     assert len(said.splitlines()) <= 24
 
 

@@ -1,11 +1,7 @@
 """The examples are documentation: each runs, in order, each on what the ones before it left."""
 
-import contextlib
-import io
 import json
 import re
-import runpy
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -21,27 +17,6 @@ pytestmark = pytest.mark.slow
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("[0-9]*.py"))
 
 
-@pytest.fixture(scope="module")
-def story(tmp_path_factory):
-    """The folder that all examples wrote into, and what each of them said."""
-    out = tmp_path_factory.mktemp("examples")
-    said = {}
-    for file in EXAMPLES:  # as `python FILE FOLDER`, without loading the package eight times
-        with (
-            pytest.MonkeyPatch.context() as patch,
-            contextlib.chdir(out),
-            contextlib.redirect_stdout(io.StringIO()) as told,
-        ):
-            patch.setattr(sys, "argv", [str(file), str(out)])
-            runpy.run_path(str(file), run_name="__main__")
-        said[file.name[:2]] = told.getvalue()
-    return out, said
-
-
-def test_there_are_eight_in_order():
-    assert [file.name[:2] for file in EXAMPLES] == [f"{n:02}" for n in range(1, 9)]
-
-
 def test_a_resection_is_planned(story):
     out, said = story
     assert "tumor_1 lies wholly inside" in said["07"]
@@ -53,26 +28,11 @@ def test_a_resection_is_planned(story):
         assert (out / f"plan_{method}.png").stat().st_size > 50_000
 
 
-def test_nothing_has_to_be_trained(story):
-    """The verdict, then the three parts, in the third."""
-    _, said = story
-    assert re.fullmatch(r"(good|poor): .+\n(\w+: [\d.]+ ml at \(.+\) mm\n){3}", said["03"])
-
-
-def test_examples_use_the_public_names_alone():
-    for file in EXAMPLES:
-        imports = re.findall(r"^\s*(?:from|import) (tumortrack\S*).*", file.read_text(), re.M)
-        assert imports[0] == "tumortrack"
-        assert imports[1:] in ([], ["tumortrack_resection"])
-
-
 def test_a_moving_organ_is_followed(story):
     _, said = story
     heard = [float(x) for x in re.findall(r"off by ([0-9.]+) mm; ", said["06"])]
     assert len(heard) >= 10
     assert 0.01 < np.median(heard) < 3
-    assert "that was all" in said["06"]
-    assert "latency p50" in said["06"]
 
 
 def test_touches_bring_a_hidden_half_nearer(story):
@@ -87,13 +47,12 @@ def test_touches_bring_a_hidden_half_nearer(story):
 
 
 def test_the_case_is_the_phantom(story):
-    out, said = story
+    out, _ = story
     case = load_case(out / "case")
     assert len(case.anatomy.tumors) == 2
     # Balls of 38 and 32 mm, lobulated by 8 % at most, through a coarse scan.
     for tumor, diameter in zip(case.anatomy.tumors, (38.0, 32.0), strict=True):
         assert tumor.volume_mm3 == pytest.approx(np.pi / 6 * diameter**3, rel=0.06)
-    assert "bright pieces beside the organ dropped" in said["01"]
     assert (out / "case" / "qc.png").stat().st_size > 10_000
 
 

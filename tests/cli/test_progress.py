@@ -42,20 +42,3 @@ def test_a_slow_first_step_tells_no_rate(monkeypatch, capsys):
             clock.sleep(2.0)
             advance()
     assert "9 of 10 | 2.0 s each | 0:02 left" in capsys.readouterr().out
-
-
-def test_what_comes_after_is_counted_from_one(monkeypatch, capsys):
-    clock = Clock()
-    monkeypatch.setattr(console, "time", clock)
-    with console.progress_bar("evaluate", 20, then="draw") as advance:
-        for _ in range(20):
-            clock.sleep(1.0)
-            advance()
-        assert (
-            capsys.readouterr().out.splitlines()[-1]
-            == "evaluate: 15 of 20 | 1.0 s each | 0:05 left"
-        )
-        for _ in range(20):
-            clock.sleep(2.0)
-            advance()
-    assert capsys.readouterr().out.splitlines()[0] == "draw: 5 of 20 | 2.0 s each | 0:30 left"

@@ -1,11 +1,10 @@
-"""The renderer's loops against every triangle tried in every pixel, and against known light."""
+"""The renderer's loop against every triangle tried in every pixel."""
 
 import numpy as np
 import pytest
 
 from render_objects import bumpy
-from tumortrack.report.renderer import Viewpoint
-from tumortrack.report.renderer_kernels import Triangles, nearest, shade
+from tumortrack.report.renderer import Viewpoint, blend, nearest
 
 WIDTH, HEIGHT = 60, 45
 
@@ -57,23 +56,15 @@ def test_what_reaches_behind_the_eye_or_has_no_size_is_not_seen():
     assert (nearest(whole, WIDTH, HEIGHT, np.inf, True)[1] == 0).sum() > 600
 
 
-def test_light_of_a_triangle_seen_face_on():
-    """Light and eye straight above: all light is there, and the gloss of a mirror."""
-    corners = np.array([[[0, 0, 0], [WIDTH, 0, 0], [0, HEIGHT, 0]]], np.float32)
-    up = np.array([0, 0, 1], np.float32)
-    normals = np.broadcast_to(up, (1, 3, 3)).copy()
-    colour = np.array([[0.2, 0.4, 0.9]], np.float32)
-    seen = corners + up
-    winner = nearest(seen, WIDTH, HEIGHT, np.inf, False)[1]
-    picture = np.zeros((HEIGHT, WIDTH, 3), np.float32)
-    eye = np.array([20, 15, 1e6], np.float32), False
-    triangles = Triangles(corners, normals, colour)
-    shade(picture, winner, seen, triangles, (up, up), eye, 0.25)
-    expected = 0.25 * np.minimum(colour[0] * (0.46 + 0.1 + 0.5) + 0.16, 1.0)
-    np.testing.assert_allclose(picture[15, 20], expected, rtol=1e-5)
-    assert (picture[winner < 0] == 0).all()
-    # From behind it is lit by the rest of the light alone, and from the side it is denser.
-    dark, above = -up, np.array([20, 15, 1e6], np.float32)
-    picture[:] = 0
-    shade(picture, winner, seen, triangles, (dark, dark), (above, False), 1.0)
-    np.testing.assert_allclose(picture[15, 20], colour[0] * (0.46 - 0.1), rtol=1e-5)
+@pytest.mark.parametrize("perspective", [False, True])
+def test_a_pixel_has_its_share_of_each_corners_colour(perspective):
+    """Half way between two corners, one of them twice as near."""
+    seen = np.array([[[0, 0, 2], [40, 0, 1], [0, 40, 1]]], np.float32)
+    colours = np.array([[[1, 0, 0, 0.5], [0, 1, 0, 0.5], [0, 0, 1, 0.5]]], np.float32)
+    winner = nearest(seen, WIDTH, HEIGHT, np.inf, perspective)[1]
+    picture = np.ones((HEIGHT, WIDTH, 3), np.float32)
+    blend(picture, winner, seen, colours, perspective)
+    share = 2 / 3 if perspective else 1 / 2
+    expected = 0.5 + 0.5 * np.array([share, 1 - share, 0])
+    np.testing.assert_allclose(picture[0, 20], expected, rtol=1e-5)
+    assert (picture[winner < 0] == 1).all()

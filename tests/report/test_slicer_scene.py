@@ -188,15 +188,14 @@ def test_what_slicer_writes_is_read_where_slicer_has_it(tmp_path: Path) -> None:
 def test_what_does_not_fit_is_refused(folders: tuple[Path, Path], tmp_path: Path) -> None:
     case, run = folders
     out = tmp_path / "out"
-    for options, word in (
-        ({"located": run, "live": "localhost:1"}, "one of them"),
-        ({"live": "18944"}, "HOST:PORT"),
-        ({"located": case}, "'run' is needed"),
+    for given, options in (
+        (case, {"located": run, "live": "localhost:1"}),
+        (case, {"live": "18944"}),
+        (case, {"located": case}),
+        (run, {"live": "localhost:1"}),
     ):
-        with pytest.raises(InputError, match=word):
-            Export(case=case, out=out, **options).run()
-    with pytest.raises(InputError, match="are for a case"):
-        Export(case=run, out=out, live="localhost:1").run()
+        with pytest.raises(InputError):
+            Export(case=given, out=out, **options).run()
     other = tmp_path / "other"
     other.mkdir()
     case_of = store.read_manifest(case, "case")

@@ -11,7 +11,6 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from tumortrack.cli.console import (
     Device,
-    console,
     keep_loaded,
     model_folder,
     options_of,
@@ -19,11 +18,10 @@ from tumortrack.cli.console import (
     progress_of,
     say,
     say_notes,
+    say_table,
 )
 from tumortrack.imaging.options import ORGAN_HU, PrepareOptions
 from tumortrack.tracking.options import ExportOptions, SimulateOptions, check_grid
-
-_PROCESSES = 2  # that `evaluate` begins at most: each takes 0.6 GB
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,16 +143,16 @@ class Evaluate:
     overwrite: bool = False
 
     def run(self) -> None:
-        from tumortrack.report.place import check_place
+        from tumortrack.report.protocol import check_place
 
         check_grid(self.grid)
         check_place(self.report, self.overwrite)
         result = self.write()
 
-        from tumortrack.report.summary import conclusions, headlines, summary_tables
+        from tumortrack.report.summary import conclusions, error_table, headlines, part_table
 
-        for table in summary_tables(result):
-            console.print(table)
+        for table in (error_table(result["summary"]), part_table(result["summary"])):
+            say_table(table)
         for line in (*conclusions(result["scenes"]), *headlines(result["summary"])):
             say(line)
         if missing := result["rivals"].get("not_available"):
@@ -172,12 +170,13 @@ class Evaluate:
         say(f"comparing {self.model} with the truth of {count} scenes; loading it ...")
         say(str(patient))
 
-        from tumortrack.report.protocol import Asked, evaluate_model
+        from tumortrack.report.protocol import evaluate_model
 
         keep_loaded()
-        with progress_bar("evaluate", count, then="draw") as advance:
-            asked = Asked(self.grid, self.seed, self.device, _PROCESSES)
-            return evaluate_model(folder, self.variants, self.report, asked, advance, advance)
+        with progress_bar("evaluate", count) as advance:
+            return evaluate_model(
+                folder, self.variants, self.report, self.grid, self.seed, self.device, advance
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

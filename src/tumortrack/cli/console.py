@@ -11,13 +11,17 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
 from functools import partial
+from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
 from tumortrack.tracking import options
 from tumortrack.tracking.options import Device as Device
+
+if TYPE_CHECKING:
+    from tumortrack.report.summary import Table
 
 _EVERY_S = 15.0  # between lines where there is no terminal
 
@@ -53,31 +57,37 @@ def say_notes(notes: Iterable[str]) -> None:
         say(f"note: {note}")
 
 
+def say_table(content: Table) -> None:
+    """Print a table in the terminal's width; nothing if it has no rows."""
+    from rich.table import Table as Grid
+
+    if not content.rows:
+        return
+    grid = Grid(title=content.title or None, caption=content.caption or None)
+    for n, name in enumerate(content.head):
+        grid.add_column(name, no_wrap=n == 0, overflow="fold", justify="left" if n < 3 else "right")
+    for row in content.rows:
+        grid.add_row(*row)
+    console.print(grid)
+
+
 @contextmanager
-def progress_bar(what: str, total: int, then: str = "") -> Iterator[Callable[[], None]]:
+def progress_bar(what: str, total: int) -> Iterator[Callable[[], None]]:
     """Shows progress, speed and the time left; yields a function to call after each of ``total``
-    steps, and of as many of what comes ``then``. Begin it before slow imports."""
-    done = 0
-
+    steps. Begin it before slow imports."""
+    steps = count(1)
     with progress_of(what, f"{what}: 0 of {total} ...") as show:
-
-        def advance() -> None:
-            nonlocal done
-            before, done = done, done + 1
-            show(before % total + 1, total, then if before >= total else what)
-
-        yield advance
+        yield lambda: show(next(steps), total)
 
 
 @contextmanager
 def progress_of(what: str, first: str = "") -> Iterator[Callable[..., None]]:
-    """The same, but the yielded function takes the number of steps done, of how many, and what if
-    it is something else."""
+    """The same, but the yielded function takes the number of steps done, and of how many."""
     first_s = 0.0
 
     with live_line(first or f"{what} ...") as line:
 
-        def show(done: int, total: int, what: str = what) -> None:
+        def show(done: int, total: int) -> None:
             nonlocal first_s
             if done == 1:  # may have included imports and compilation: says nothing of the rate
                 first_s = time.monotonic()

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import tumortrack
 from tumortrack.cli.cases import Evaluate, Prepare
-from tumortrack.cli.console import console, say
+from tumortrack.cli.console import say, say_table
 from tumortrack.cli.main import command
 from tumortrack.cli.training import Train
 from tumortrack.core import store
@@ -74,7 +74,7 @@ class Demo:
             say(f"labels to first estimate: {to_first_s:.0f} s, from the CT.")
         if self.preset != "clinic":
             self._show_paper(report)
-        console.print(scene_table(report["scenes"]))
+        say_table(scene_table(report["scenes"]))
         for line in conclusions(report["scenes"]):
             say(line)
         say(f"open {out / 'index.html'} in a browser: estimate over truth, in 3-D, scene by scene.")

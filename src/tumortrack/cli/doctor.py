@@ -14,7 +14,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
-import msgspec
 from packaging.requirements import Requirement
 from tyro.conf import Positional
 
@@ -22,26 +21,46 @@ from tumortrack.cli.console import Device, say
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.packages import to_install
 from tumortrack.core.process import available_cores
-from tumortrack.core.tables import read_table
 from tumortrack.models.method import GROUP
 from tumortrack.native import LIBRARIES, library
 
 
-class _Table(msgspec.Struct, forbid_unknown_fields=True):
-    """See doctor.toml."""
-
-    purposes: dict[str, dict[str, str]]
-    modules: dict[str, str]
-    parts: dict[str, str]
-    system: dict[str, tuple[str, str]]
-
-
-_TABLE = read_table("tumortrack.cli", "doctor.toml", _Table)
+# What each distribution is for, and each of its extras; "": what it always needs.
 PURPOSES = {
-    (name, extra): words
-    for name, extras in _TABLE.purposes.items()
-    for extra, words in extras.items()
+    ("tumortrack", ""): "cases, locating, tracking",
+    ("tumortrack", "dicom"): "DICOM segmentations",
+    ("tumortrack", "pcd"): ".pcd clouds",
+    ("tumortrack-occupancy", ""): "the paper's method: networks and their training",
+    ("tumortrack-occupancy", "onnx"): "networks as ONNX files",
+    ("tumortrack-occupancy", "tensorboard"): "training curves",
+    ("tumortrack-devices", ""): "recordings, ROS 2, the web viewer, 3D Slicer",
+    ("tumortrack-devices", "realsense"): "RealSense cameras",
+    ("tumortrack-devices", "stereo"): "depth from two pictures",
+    ("tumortrack-resection", ""): "plans of a resection",
+    ("tumortrack-resection", "arms"): "motions of two arms",
+    ("tumortrack-resection", "ur"): "a real arm of Universal Robots",
+    ("tumortrack-experiment", ""): "phantoms, calibrations, recordings",
+    ("tumortrack-lab", ""): "digital twin, studies, benchmarks",
+    ("tumortrack-lab", "fleet"): "many patients on many machines",
 }
+_MODULES = {  # import names that differ from the package's
+    "opencv-python-headless": "cv2",
+    "pillow": "PIL",
+    "pin": "pinocchio",
+    "python-gdcm": "gdcm",
+    "scikit-fem": "skfem",
+    "scikit-image": "skimage",
+    "ur_rtde": "rtde_control",
+}
+_PARTS = {  # packages that only a part of their extra needs: the rest works without them
+    "rosbags": "recordings, and messages of ROS",
+    "cyclonedds": "ROS 2",
+    "viser": "the web viewer",
+    "fastcrc": "OpenIGTLink to 3D Slicer",
+    "pyrealsense2": "RealSense cameras",
+}
+# System libraries, which pip cannot install, and how to.
+_SYSTEM = {"pyrealsense2": ("libusb", "apt-get install libusb-1.0-0")}
 _ABSENT = " is not installed"
 Status = tuple[Literal["ok", "absent", "BROKEN"], str]  # with its text
 
@@ -124,7 +143,7 @@ def part(name: str, extra: str, purpose: str) -> Iterator[Status]:
         return
     faults = {package.name: fault for package in needed if (fault := _fault(package))}
     works = [package.name for package in needed if package.name not in faults]
-    parts = _TABLE.parts if works else _TABLE.system
+    parts = _PARTS if works else _SYSTEM
     alone = {name: fault for name, fault in faults.items() if name in parts}
     if rest := [fault for name, fault in faults.items() if name not in alone]:
         absent = extra and all(fault.endswith(_ABSENT) for fault in rest)
@@ -133,31 +152,27 @@ def part(name: str, extra: str, purpose: str) -> Iterator[Status]:
         there = ", ".join(f"{name} {version(name)}" for name in works)
         yield "ok", f"{what}: {purpose}{', but for what follows' if alone else ''}; {there}"
     for package, fault in alone.items():
-        library, cure = _TABLE.system.get(package, ("", ""))
+        library, cure = _SYSTEM.get(package, ("", ""))
         if not (library and library in fault):
             library, cure = "", install
         absent = bool(library) or fault.endswith(_ABSENT)
-        yield "absent" if absent else "BROKEN", f"{_TABLE.parts[package]}: {fault}; {cure}"
+        yield "absent" if absent else "BROKEN", f"{_PARTS[package]}: {fault}; {cure}"
 
 
 def _needed(name: str, extra: str) -> Iterator[Requirement]:
-    """Its requirements on this machine, those of further extras that it names included."""
+    """Its requirements on this machine ("": whatever the extras), those of further extras that it
+    names included."""
     for needed in map(Requirement, requires(name) or ()):
-        if not _belongs(needed, extra):
+        marker = needed.marker
+        always = marker is None or marker.evaluate({"extra": ""})
+        of_extra = marker is not None and not always and marker.evaluate({"extra": extra})
+        if not (of_extra if extra else always):
             continue
         if needed.name == name:
             for other in needed.extras:
                 yield from _needed(name, other)
         else:
             yield needed
-
-
-def _belongs(needed: Requirement, extra: str) -> bool:
-    """Whether this machine needs it for the extra; "": whatever the extras."""
-    marker = needed.marker
-    if marker is None or marker.evaluate({"extra": ""}):
-        return not extra
-    return marker.evaluate({"extra": extra})
 
 
 def _fault(needed: Requirement) -> str:
@@ -169,7 +184,7 @@ def _fault(needed: Requirement) -> str:
     if not needed.specifier.contains(present, prereleases=True):
         return f"{needed.name} {present} is installed, but {needed.specifier} is supported"
     try:
-        import_module(_TABLE.modules.get(needed.name, needed.name.replace("-", "_")))
+        import_module(_MODULES.get(needed.name, needed.name.replace("-", "_")))
     except Exception as error:  # a broken installation raises anything
         return f"{needed.name} {present}: {error}"
     return ""

@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional, UseAppendAction
 
-from tumortrack.cli.console import console, model_folder, options_of, say, say_json, say_notes
+from tumortrack.cli.console import (
+    console,
+    keep_loaded,
+    model_folder,
+    options_of,
+    say,
+    say_json,
+    say_notes,
+)
 from tumortrack.core import store
 from tumortrack.core.errors import EXIT_STATUSES, InputError, NoEstimate
 from tumortrack.tracking.options import LocateOptions, check_grid
@@ -75,6 +83,7 @@ class Locate(LocateOptions):
             _say_written(located.estimate, located, out)
         if self.json:
             say_json(located.report)
+        keep_loaded()  # a quicker end
         if located.estimate is None:
             raise NoEstimate(
                 f"none: {located.reason} What was seen: {out / PAGE}"
@@ -85,7 +94,7 @@ class Locate(LocateOptions):
 def _say_estimate(estimate: Estimate, located: Located) -> None:
     """The verdict, and where each part is."""
     from tumortrack.core.estimate import verdict_words
-    from tumortrack.report.seen import alternative_lines, next_lines, part_rows, row_words
+    from tumortrack.report.seen import other_lines, part_rows, row_words
 
     report = estimate.report
     say(verdict_words(estimate.quality, estimate.reason))
@@ -98,9 +107,7 @@ def _say_estimate(estimate: Estimate, located: Located) -> None:
             say(f"{each.name} {number}: {each.off_mm:.1f} mm off{', left out' * each.left_out}")
     if agree > _MOST_SAID:
         say(f"{agree} pieces of evidence agree with the answer")
-    for line in alternative_lines(estimate):
-        say(line)
-    for line in next_lines(estimate):
+    for line in other_lines(estimate):
         say(line)
     for view in located.about["input"]:
         say(view["words"])

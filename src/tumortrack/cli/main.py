@@ -9,10 +9,10 @@ import signal
 import sys
 from collections.abc import Callable
 from importlib import import_module
-from typing import NoReturn, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import tumortrack
-from tumortrack.core.errors import EXIT_STATUSES, InputError, PackageError, TumortrackError
+from tumortrack.core.errors import InputError, PackageError, TumortrackError
 from tumortrack.core.packages import to_install
 from tumortrack.core.process import interrupt_between_imports
 
@@ -41,7 +41,6 @@ _DISTRIBUTIONS = {
 }
 _OBJECTS_PER_COLLECTION = 20_000
 _STOPPED = 130  # by Ctrl-C
-_EXITS_AT_ONCE = ["locate"]  # leaves nothing open, and users wait for its end
 
 
 def main() -> None:
@@ -57,8 +56,6 @@ def main() -> None:
     code = run(sys.argv[1:])
     if code == _STOPPED:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C changes nothing
-    if sys.argv[1:2] == _EXITS_AT_ONCE and code in EXIT_STATUSES.values():
-        leave(code)
     if code:
         sys.exit(code)
 
@@ -89,14 +86,6 @@ def run(arguments: list[str]) -> int:
         print(f"tumortrack: {where}: {error.strerror}.", file=sys.stderr)
         return InputError.exit_code
     return code
-
-
-def leave(code: int = 0) -> NoReturn:
-    """End the process at once, after everything is written: a regular exit takes a tenth of
-    `locate`'s time more. Exit handlers are not called."""
-    if sys.stderr is not None:  # as after 2>&-
-        sys.stderr.flush()
-    os._exit(code)
 
 
 def command(name: str) -> Callable[..., Command]:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Literal
 from tyro.conf import Positional
 
 from tumortrack.cli.console import Device, keep_loaded, live_line, progress_of, say, say_notes
-from tumortrack.core.errors import InputError
 
 if TYPE_CHECKING:
     from tumortrack.imaging.case import Case
@@ -60,14 +59,6 @@ class Train:
         from tumortrack import api
         from tumortrack.models import folder
 
-        if self.minutes is not None and not self.minutes >= 0:
-            raise InputError(f"--minutes {self.minutes} must be 0 or more.")
-        if self.steps is not None and self.steps < 0:
-            raise InputError(f"--steps {self.steps} must be 0 or more.")
-        if self.minutes is not None and self.steps is not None:
-            raise InputError("--minutes and --steps both say when to stop; give one of them.")
-        if self.workers is not None and self.workers < 0:
-            raise InputError(f"--workers {self.workers} must be 0 or more.")
         case = api.load_case(self.case)
         train = partial(
             api.train, case, self.model, preset=self.preset, rotations=self.rotations,

@@ -171,14 +171,6 @@ def draw_lines(axes: Axes, segments: Float[np.ndarray, "n 2 2"], **style: Any) -
     axes.add_artist(PathPatch(lines, fill=False, capstyle="round", **style))
 
 
-def tint(axes: Axes, masks: Sequence[tuple[Bool[np.ndarray, "h w"], RGB]], frame: Frame) -> None:
-    """A quarter of each colour where its mask is true, one over another on white."""
-    picture = np.full((*masks[0][0].shape, 3), 255, np.uint8)
-    for mask, color in masks:
-        picture[mask] = np.rint(0.75 * picture[mask] + 0.25 * 255 * np.array(color))
-    axes.imshow(picture, extent=frame.extent, zorder=1, interpolation="nearest")
-
-
 def finish_view(
     axes: Axes,
     frame: Frame,

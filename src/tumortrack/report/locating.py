@@ -67,11 +67,11 @@ class Located:
     def save(self, folder: str | Path, overwrite: bool = False) -> None:
         """Write the folder that `tumortrack locate` writes. Raises InputError: it exists and
         ``overwrite`` is False; StorageError: the disk refused."""
-        from tumortrack.report.run_page import write_run_page
+        from tumortrack.report.page import write_run_page
         from tumortrack.tracking import files
 
         report, folder = self.report, Path(folder)
-        add = partial(write_run_page, report=report, estimate=self.estimate, seen=self.seen)
+        add = partial(write_run_page, report=report, estimate=self.estimate, shown=self.seen)
         if self.estimate is None:
             files.write_no_estimate(folder, report, overwrite, add)
         else:

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Int32, UInt8
 from PIL import Image
 
 from tumortrack.core.colours import Colour
 from tumortrack.core.geometry import transform_points, triangles_of
 from tumortrack.core.types import Mesh
-from tumortrack.report.renderer_kernels import Triangles, mean_normals, nearest, shade
+from tumortrack.native import F32, I32, kernel
 
 _OVERSAMPLING = 2  # pixels drawn per pixel shown, along each axis: antialiasing
 _CREASE_RAD = np.radians(40.0)  # faces that meet at a sharper angle keep their edge
@@ -35,6 +35,27 @@ def rgb(colour: Colour) -> RGB:
     """The same in 0..1."""
     red, green, blue = (value / 255 for value in colour)
     return red, green, blue
+
+
+_SEEN = F32["t", 3, 3].any_value  # may overflow at the eye
+_nearest = kernel("nearest", _SEEN, float, int, F32["h", "w"].out, I32["h", "w"].out)
+# Lays each pixel's triangle (``winner``, -1: none) over what is there; of its corners' colours and
+# covers as much as there is of each in the pixel.
+blend = kernel("blend", F32["h", "w", 3].out, I32["h", "w"], _SEEN, F32["t", 3, 4], int)
+
+
+def nearest(
+    seen: Float32[np.ndarray, "t 3 3"], width: int, height: int, limit: float, perspective: bool
+) -> tuple[Float32[np.ndarray, "h w"], Int32[np.ndarray, "h w"]]:
+    """Greatest nearness up to the limit in each pixel (-inf: nothing) and whose it is (-1).
+
+    Seen are the corners' column, row and nearness, linear in the picture. In perspective a triangle
+    that reaches behind the eye (nearness 0 or less) is left out.
+    """
+    near = np.full((height, width), -np.inf, np.float32)
+    winner = np.full((height, width), -1, np.int32)
+    _nearest(seen, limit, perspective, near, winner)
+    return near, winner
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,11 +214,10 @@ def render(
     Opaque bodies hide each other by depth; translucent ones tint what is behind them.
     """
     width, height = (_OVERSAMPLING * n for n in size)
-    solid = _join([body for body in bodies if body.opacity >= 1])
     picture = np.empty((height, width, 3), np.float32)
     picture[:] = np.array(backdrop)
     near = np.full((height, width), -np.inf, np.float32)
-    near = _paint(picture, near, solid, viewpoint, 1.0)
+    near = _paint(picture, near, [body for body in bodies if body.opacity >= 1], viewpoint)
 
     def far_first(body: Body) -> float:
         middle = body.mesh.box_mm.mean(0)[None]
@@ -206,61 +226,79 @@ def render(
         return -float(np.linalg.norm(middle[0] - viewpoint.place_mm))
 
     for body in sorted((body for body in bodies if body.opacity < 1), key=far_first):
-        _paint(picture, near, _join([body]), viewpoint, body.opacity)
+        _paint(picture, near, [body], viewpoint)
     sharp = Image.fromarray(np.rint(255 * picture).astype(np.uint8))
     return np.asarray(sharp.reduce(_OVERSAMPLING))
-
-
-def _join(bodies: list[Body]) -> Triangles:
-    corners, normals = [np.zeros((0, 3, 3))], [np.zeros((0, 3, 3), np.float32)]
-    for body in bodies:
-        vertices, normal = body.mesh.vertices_mm, corner_normals(body.mesh)
-        if (way := body.world_from_mesh) is not None:
-            vertices = transform_points(way, vertices)
-            normal = normal @ way[:3, :3].T.astype(np.float32)
-        corners.append(vertices[body.mesh.faces])
-        normals.append(normal)
-    each = [len(body.mesh.faces) for body in bodies]
-    colors = np.array([body.color for body in bodies], np.float32).reshape(-1, 3)
-    return Triangles(
-        np.concatenate(corners).astype(np.float32),
-        np.concatenate(normals),
-        np.repeat(colors, each, axis=0),
-    )
 
 
 _NORMALS: WeakKeyDictionary[Mesh, np.ndarray] = WeakKeyDictionary()
 
 
 def corner_normals(mesh: Mesh) -> Float32[np.ndarray, "f 3 3"]:
-    """Unit normal at each face's corners: the mean over the faces there, but beyond a crease."""
+    """Unit normal at each face's corners: the mean over the faces there, or at a crease the
+    face's."""
     if (known := _NORMALS.get(mesh)) is not None:
         return known
     order = np.lexsort(mesh.vertices_mm.T)
     new = (np.diff(mesh.vertices_mm[order], axis=0) != 0).any(1)
     place = np.empty(len(order), np.int64)
     place[order] = np.append(0, np.cumsum(new))[: len(order)]
+    corner = place[mesh.faces]
     weighted = triangles_of(mesh.vertices_mm, mesh.faces)[1]
-    facing = weighted / np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-12)
-    normals = mean_normals(place[mesh.faces], weighted, facing, np.cos(_CREASE_RAD))
+    area = np.linalg.norm(weighted, axis=1)
+    sums = np.stack([np.bincount(corner.ravel(), np.repeat(w, 3)) for w in weighted.T], axis=1)
+    areas = np.maximum(np.bincount(corner.ravel(), np.repeat(area, 3)), 1e-12)
+    length = np.linalg.norm(sums, axis=1)
+    smooth = (length / areas > np.cos(_CREASE_RAD / 2))[corner]
+    mean = sums / np.maximum(length, 1e-12)[:, None]
+    facing = weighted / np.maximum(area, 1e-12)[:, None]
+    normals = np.where(smooth[..., None], mean[corner], facing[:, None]).astype(np.float32)
     _NORMALS[mesh] = normals
     return normals
 
 
+def _corners(
+    body: Body, viewpoint: Viewpoint
+) -> tuple[Float[np.ndarray, "f 3 3"], Float32[np.ndarray, "f 3 4"]]:
+    """Each face's corners in the world, mm, and their colours in a diffuse light and a little
+    gloss, with how much of what is behind them they cover."""
+    vertices, normals = body.mesh.vertices_mm, corner_normals(body.mesh)
+    if (way := body.world_from_mesh) is not None:
+        vertices = transform_points(way, vertices)
+        normals = normals @ way[:3, :3].T.astype(np.float32)
+    corners = vertices[body.mesh.faces]
+    view = viewpoint.place_mm - corners
+    view /= np.linalg.norm(view, axis=-1, keepdims=True)
+    toward = np.einsum("fkx,fkx->fk", normals, view)
+    normals = np.where(toward[..., None] < 0, -normals, normals)  # of a surface seen from behind
+    half = viewpoint.light + view  # half way between the light and the viewer
+    half /= np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-9)
+    lit = np.maximum(normals @ viewpoint.light, 0)
+    gloss = 0.16 * np.maximum(np.einsum("fkx,fkx->fk", normals, half), 0) ** 40 * (lit > 0)
+    strength = 0.46 + 0.1 * normals @ viewpoint.up + 0.5 * lit
+    color = np.minimum(np.array(body.color) * strength[..., None] + gloss[..., None], 1)
+    slant = 1 - np.abs(toward)  # edges are denser
+    cover = body.opacity + (1 - body.opacity) * 0.75 * slant**2
+    return corners, np.concatenate([color, cover[..., None]], axis=-1).astype(np.float32)
+
+
 def _paint(
     picture: Float32[np.ndarray, "h w 3"], below: Float32[np.ndarray, "h w"],
-    triangles: Triangles, viewpoint: Viewpoint, opacity: float,
+    bodies: list[Body], viewpoint: Viewpoint,
 ) -> Float32[np.ndarray, "h w"]:  # fmt: skip
-    """Paint triangles where nothing in ``below`` is nearer; returns their nearness (-inf: none)."""
+    """Paint bodies where nothing in ``below`` is nearer; returns their nearness (-inf: none)."""
+    if not bodies:
+        return below
+    corners, colours = map(
+        np.concatenate, zip(*(_corners(body, viewpoint) for body in bodies), strict=True)
+    )
     size = picture.shape[1], picture.shape[0]
-    seen = viewpoint.project(triangles.corners.astype(float), size).astype(np.float32)
+    seen = viewpoint.project(corners, size).astype(np.float32)
     perspective = not viewpoint.parallel
     closest_mm = max(viewpoint.distance_mm - viewpoint.before_mm, 1.0)
     limit = 1 / closest_mm if perspective else -closest_mm
     near, winner = nearest(seen, *size, limit, perspective)
     one_mm = near**2 if perspective else np.float32(1.0)  # of nearness
     winner[near - _SAME_MM * one_mm <= below] = -1
-    light = viewpoint.light.astype(np.float32), viewpoint.up.astype(np.float32)
-    eye = viewpoint.place_mm.astype(np.float32), perspective
-    shade(picture, winner, seen, triangles, light, eye, opacity)
+    blend(picture, winner, seen, colours, perspective)
     return near

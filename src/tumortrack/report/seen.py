@@ -1,15 +1,16 @@
-"""Inputs of a run's page, and an estimate's parts in words; light to import, unlike ``run_page``,
-which draws the page."""
+"""What was seen in a run, and an estimate's parts in words; light to import, unlike the pages."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import UInt8
 
-from tumortrack.core.report import FAR_OFF, FitReport, NextEvidence
+from tumortrack.core import colours
+from tumortrack.core.report import FAR_OFF, FitReport, NextEvidence, Point
 from tumortrack.core.types import DepthFrame, SensorCloud
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from tumortrack.core.estimate import Estimate
     from tumortrack.tracking.slices import CarriedCt
 
-PAGE = "index.html"
+PAGE, PICTURE = "index.html", "picture.png"
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,27 +52,32 @@ def part_rows(report: FitReport, assessment: Assessment) -> list[dict[str, str]]
     return rows
 
 
-def alternative_lines(estimate: Estimate | None) -> list[str]:
-    """Other places that the points allow as well, which put a tumor elsewhere."""
-    cost = None if estimate is None else estimate.report.fit_cost
-    return [other.words for other in (() if cost is None else cost.others)]
+def row_words(row: dict[str, str]) -> str:
+    words = (f"centre {row['centre']}", row["bound"], row["volume"])
+    return f"{row['part']}: {', '.join(filter(None, words)).replace('centre not', 'not')}"
 
 
-def next_evidence(estimate: Estimate | None) -> tuple[NextEvidence, ...]:
-    """What to learn next; nothing of an answer that may be another organ, or in another place."""
-    if estimate is None or (estimate.finding is not None and estimate.finding.kind not in FAR_OFF):
+def other_lines(estimate: Estimate) -> list[str]:
+    """Other places that the points allow as well, which put a tumor elsewhere; and the best of what
+    can be learnt next at once: each kind's first alone, as what follows it presumes it."""
+    cost = estimate.report.fit_cost
+    first = {each.kind: each for each in reversed(_next_evidence(estimate))}.values()
+    best = min(first, key=lambda each: each.then_bound_mm or np.inf, default=None)
+    lines = [other.words for other in (() if cost is None else cost.others)]
+    return lines + ([] if best is None else [f"next, {best.words}"])
+
+
+def _next_evidence(estimate: Estimate) -> tuple[NextEvidence, ...]:
+    """Nothing of an answer that may be another organ, or in another place."""
+    if estimate.finding is not None and estimate.finding.kind not in FAR_OFF:
         return ()
     return estimate.assessment.next_evidence
 
 
-def next_lines(estimate: Estimate | None) -> list[str]:
-    """The same in words: the best of what can be done at once, each kind's first alone; what
-    follows it presumes it."""
-    first = {each.kind: each for each in reversed(next_evidence(estimate))}.values()
-    best = min(first, key=lambda each: each.then_bound_mm or np.inf, default=None)
-    return [] if best is None else [f"next, {best.words}"]
-
-
-def row_words(row: dict[str, str]) -> str:
-    words = (f"centre {row['centre']}", row["bound"], row["volume"])
-    return f"{row['part']}: {', '.join(filter(None, words)).replace('centre not', 'not')}"
+def spots(estimate: Estimate) -> Iterator[tuple[Point, colours.Colour]]:
+    """Where evidence lies, and where to touch next."""
+    for each in estimate.report.evidence:
+        colour = colours.NONE if each.left_out else colours.WHITE
+        yield from ((place_mm, colour) for place_mm in each.places_mm)
+    touches = (each for each in _next_evidence(estimate) if each.kind == "touch")
+    yield from ((each.place_mm, colours.TO_CUT) for each in touches)

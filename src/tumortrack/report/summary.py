@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import Any
+from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
-from rich.table import Table
 
 from tumortrack.core.estimate import FAR_MM, NO_CHECK_FAILED
 from tumortrack.core.organ import is_tumor
-from tumortrack.core.tables import read_table
 from tumortrack.report.metrics import SurfaceDistances
 
 DISTANCES = (*(field.name for field in fields(SurfaceDistances)), "center_mm")
@@ -19,23 +16,46 @@ TARGET_ERRORS = ("mean", "rms", "median", "p95")
 VERDICTS = ("good", "poor", "none")
 
 
-class _Said(msgspec.Struct, forbid_unknown_fields=True):
-    """See evaluation.toml."""
-
-    medians: str
-    rule: str
-    no_rivals: str
-    rivals: dict[str, str]
-    columns: dict[str, str]
-
-
-SAID = read_table("tumortrack.report", "evaluation.toml", _Said)
+RULE = (
+    "Medians over all scenes that have the part. A part that was not found counts as infinitely far "
+    "and with IoU 0; a median that is infinite is written as null. A scene counts as failed where a "
+    "part was not found, or where the centre of a tumor (without one: of the organ) is over "
+    f"{FAR_MM:g} mm off, whether the answer is called good or poor; where nothing was found its "
+    "mIoU is 0 and its target errors are infinite."
+)
+NO_RIVALS = (
+    "Rigid registration is left out: it needs the organ at rest, which models of the preset clinic "
+    "alone keep; a function that estimates states none."
+)
+MEANING = {
+    "best_rigid_pose": "an oracle: the undeformed organ, moved onto the true one as well as rigid "
+    "motion allows",
+    "rigid_fit": "the undeformed organ, fitted to the same points by point-to-plane least squares, "
+    "started at the best rigid pose",
+}
+COLUMNS = {
+    "center_mm": "centre off, mm",
+    "hausdorff_mm": "surface off at most (Hausdorff), mm",
+    "hausdorff_95_mm": "95 % of the surface within, mm",
+    "hausdorff_one_sided_mm": "one-sided Hausdorff, mm",
+    "surface_mm": "surface off in the mean, mm",
+    "iou": "overlap (IoU, 0 to 1)",
+}
 RIVALS = {"best_rigid_pose": "best rigid pose", "rigid_fit": "rigid fit"}
 METHODS = {"estimate": "estimate", **RIVALS}
 # Of the two that a surgeon asks for; the third is of targets, where a scene has some.
 MEASURES = {"center_mm": "centre", "hausdorff_mm": "surface", "target_mm": "targets"}
 
 Entry = dict[str, Any]
+
+
+class Table(NamedTuple):
+    """For the terminal and the page."""
+
+    title: str
+    head: list[str]
+    rows: list[list[str]]
+    caption: str = ""
 
 
 def summarise(entries: list[Entry]) -> dict[str, Any]:
@@ -175,15 +195,6 @@ def verdict_counts(summary: dict[str, Any]) -> str:
     return f"{scenes}: {summary['good']} good, {summary['poor']} poor, {summary['none']} none"
 
 
-def failures(summary: dict[str, Any]) -> str:
-    """How many scenes failed, and why."""
-    missed = summary["failed"] - summary["far"]
-    return (
-        f"{summary['failed']} failed: {missed} without an answer or a part, {summary['far']} with "
-        f"a tumor's centre over {FAR_MM:g} mm off ({summary['far_good']} of them called good)"
-    )
-
-
 def spread_words(spread: dict[str, Any]) -> str:
     median, p95, worst = (number(spread[key], 1) for key in ("median", "p95", "worst"))
     where = f"{words(spread['part'])} of {spread['scene']}"
@@ -191,17 +202,12 @@ def spread_words(spread: dict[str, Any]) -> str:
 
 
 def headlines(summary: dict[str, Any]) -> list[str]:
-    """Verdicts, then errors of good answers, of poor ones and of the rivals, pooled over all
-    scenes, tumors and targets."""
-    lines = [f"{verdict_counts(summary)}. {failures(summary)}."]
+    """Errors of good answers, of poor ones and of the rivals, pooled over all scenes, tumors and
+    targets."""
     groups = summary["errors"]
-    for verdict in ("good", "poor"):
-        if verdict in groups:
-            lines += [f"{verdict}: {line}" for line in measures(groups[verdict]["estimate"])]
-    for rival, name in RIVALS.items():
-        if rival in groups.get("all", {}):
-            lines += [f"{name}: {line}" for line in measures(groups["all"][rival])]
-    return lines
+    named = {verdict: groups.get(verdict, {}).get("estimate", {}) for verdict in ("good", "poor")}
+    named |= {name: groups.get("all", {}).get(rival, {}) for rival, name in RIVALS.items()}
+    return [f"{name}: {line}" for name, group in named.items() for line in measures(group)]
 
 
 def measures(group: dict[str, Any]) -> list[str]:
@@ -217,36 +223,6 @@ def measures(group: dict[str, Any]) -> list[str]:
     return lines
 
 
-def summary_tables(report: dict[str, Any]) -> list[Table]:
-    """For the terminal: errors by verdict and method, then medians by part."""
-    summary = report["summary"]
-    errors = Table(title="errors in mm: median / 95 % within / worst, over all scenes and tumors")
-    errors.add_column("answers", no_wrap=True)
-    errors.add_column("method")
-    for head in MEASURES.values():
-        errors.add_column(head, justify="right", no_wrap=True)
-    for verdict, method, group in error_rows(summary):
-        cells = [triple(group.get(key)) for key in MEASURES]
-        errors.add_row(verdict, METHODS[method], *cells)
-    if "best_rigid_pose" in summary.get("errors", {}).get("all", {}):
-        errors.caption = "; ".join(f"{RIVALS[name]}: {text}" for name, text in SAID.rivals.items())
-    overlap = f"mIoU {summary['miou']:.3f} (overlap, 1: perfect)"
-    table = Table(title=f"medians over scenes, distances in mm; {overlap}")
-    table.add_column("part")
-    for head in ("found", "HD", "1-sided", "HD95", "surface", "centre", "IoU", "worst HD"):
-        table.add_column(head, justify="right")
-    rows = part_rows(summary)
-    if registered := any("registration_mm" in part for part in rows.values()):
-        table.add_column("± mm", justify="right")
-        table.caption = "± mm: the expected error of the truth, by its registration"
-    for name, part in rows.items():
-        numbers = [number(part[key], 1 if key != "surface_mm" else 2) for key in DISTANCES]
-        share = [number(part.get("registration_mm"))] if registered else []
-        found, worst = f"{part['found']}/{part['scenes']}", part["worst"]["hausdorff_mm"]["mm"]
-        table.add_row(name, found, *numbers, number(part["iou"]), number(worst, 1), *share)
-    return [*([errors] if errors.rows else []), table]
-
-
 def triple(spread: dict[str, Any] | None) -> str:
     """Median / 95 % / worst."""
     if spread is None:
@@ -254,41 +230,57 @@ def triple(spread: dict[str, Any] | None) -> str:
     return " / ".join(number(spread[key], 1) for key in ("median", "p95", "worst"))
 
 
-def error_rows(summary: dict[str, Any]) -> list[tuple[str, str, dict[str, Any]]]:
-    """Rows of the table of errors: verdict, method, errors."""
-    return [
-        (verdict, method, group[method])
-        for verdict, group in summary.get("errors", {}).items()
+def error_table(summary: dict[str, Any]) -> Table:
+    """By verdict and method."""
+    rows = [
+        [verdict, METHODS[method], *(triple(group[method].get(key)) for key in MEASURES)]
+        for verdict, group in summary["errors"].items()
         for method in METHODS
         if method in group
     ]
+    known = "best_rigid_pose" in summary["errors"].get("all", {})
+    caption = "; ".join(f"{RIVALS[name]}: {text}" for name, text in MEANING.items())
+    title = "errors in mm: median / 95 % within / worst, over all scenes and tumors"
+    return Table(title, ["answers", "method", *MEASURES.values()], rows, caption if known else "")
 
 
-def part_rows(summary: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    """The summary's entries of parts, by name."""
-    return {k: row for k, row in summary.items() if isinstance(row, dict) and "found" in row}
+def part_table(summary: dict[str, Any]) -> Table:
+    """Medians over the scenes."""
+    parts = {k: row for k, row in summary.items() if isinstance(row, dict) and "found" in row}
+    head = ["part", "found", "HD", "1-sided", "HD95", "surface", "centre", "IoU", "worst HD"]
+    registered = any("registration_mm" in part for part in parts.values())
+    rows = []
+    for name, part in parts.items():
+        numbers = [number(part[key], 1 if key != "surface_mm" else 2) for key in DISTANCES]
+        share = [number(part.get("registration_mm"))] if registered else []
+        found, worst = f"{part['found']}/{part['scenes']}", part["worst"]["hausdorff_mm"]["mm"]
+        rows.append([name, found, *numbers, number(part["iou"]), number(worst, 1), *share])
+    overlap = f"mIoU {summary['miou']:.3f} (overlap, 1: perfect)"
+    title = f"medians over scenes, distances in mm; {overlap}"
+    caption = "± mm: the expected error of the truth, by its registration" * registered
+    return Table(title, [*head, *["± mm"] * registered], rows, caption)
 
 
 def scene_table(entries: list[Entry]) -> Table:
-    """For the terminal: each scene, what was done to the organ, the verdict, and how far off the
-    farthest tumor is, by the estimate and by the rigid fit."""
-    table, pairs = Table(), list[bool]()
-    for head in ("scene", "organ", "verdict"):
-        table.add_column(head, no_wrap=head != "organ")
-    for head in ("off", "rigid fit"):
-        table.add_column(head, justify="right", no_wrap=True)
+    """Each scene, what was done to the organ, the verdict, and how far off the farthest tumor is,
+    by the estimate and by the rigid fit; and, if the scenes have targets, their mean error."""
+    targets = any("tre_mm" in entry for entry in entries)
+    rows, pairs = [], list[bool]()
     for entry in entries:
         far_mm, part = worst_center(entry)
         rigid_mm = rival_center(entry, "rigid_fit", part)
-        mm = number(_finite(far_mm), 1), "-" if rigid_mm is None else number(rigid_mm, 1)
-        table.add_row(entry["name"], entry.get("words", ""), entry["quality"], *mm)
+        row = [entry["name"], entry.get("words", ""), entry["quality"], number(_finite(far_mm), 1)]
+        row.append("-" if rigid_mm is None else number(rigid_mm, 1))
+        errors = entry.get("tre_mm")
+        rows.append([*row, *[number(errors["mean"], 1) if errors else "-"] * targets])
         if rigid_mm is not None:
             pairs.append(far_mm < rigid_mm)
-    table.caption = (
+    caption = (
         "off: the middle of the tumor that is farthest off, mm; nearer than by the rigid fit in "
         f"{sum(pairs)} of {len(pairs)}"
     )
-    return table
+    head = ["scene", "organ", "verdict", "off", "rigid fit", *["targets"] * targets]
+    return Table("", head, rows, caption)
 
 
 def rival_center(entry: Entry, rival: str, part: str) -> float | None:

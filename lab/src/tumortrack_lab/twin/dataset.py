@@ -20,13 +20,12 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from tumortrack.core import store
+from tumortrack.core import colours, store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import Case, load_case
-from tumortrack.report import drawing
-from tumortrack.report.pictures import FROM_CAMERA, FROM_SIDE, draw_solid_view, scene_legend
+from tumortrack.report.pictures import depth_picture, scene_views, write_sheet
 from tumortrack.simulate.scene_folder import (
     TARGETS,
     InnerPoints,
@@ -109,21 +108,14 @@ def make_scenes(
 
 
 def twin_picture(scene: Scene, path: Path) -> None:
-    """Depth image, and the cloud over the truth's outlines from the camera and from the side."""
+    """Depth image, and the cloud over the truth's outlines from the camera and from above."""
     assert scene.depth is not None
-    figure = drawing.new_figure(16.0, 4.4, top=0.8)
-    axes = figure.add_subplot(1, 3, 1)
     depth_mm, (near, far) = scene.depth.depth_mm, scene.meta["crop_mm"]
-    kept = np.where((depth_mm > near) & (depth_mm < far), depth_mm, np.nan)
-    bar = figure.colorbar(axes.imshow(kept, cmap="viridis_r"), ax=axes, fraction=0.026, pad=0.015)
-    bar.set_label("depth, mm", fontsize=9)
-    bar.ax.invert_yaxis()
-    axes.set(xticks=[], yticks=[], title=f"depth image, cropped to {near:g} .. {far:g} mm")
-    for number, view in enumerate((FROM_CAMERA, FROM_SIDE), start=2):
-        draw_solid_view(figure.add_subplot(1, 3, number), scene, {}, view)
+    kept = np.where((depth_mm > near) & (depth_mm < far), depth_mm, np.nan).astype(np.float32)
+    seen = depth_picture(replace(scene.depth, depth_mm=kept))
+    panels = [(f"depth image, cropped to {near:g} .. {far:g} mm", seen), *scene_views(scene, {})]
     words = f"{scene.meta['variant']}, {scene.meta['view']}"
-    drawing.add_words(figure, words, handles=scene_legend()[-2:])
-    drawing.save(figure, path)
+    write_sheet(path, [], [words], {"truth (outline)": colours.TRUTH}, [panels])
 
 
 def known(names: Sequence[Any], allowed: Iterable[str]) -> list:

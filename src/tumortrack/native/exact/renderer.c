@@ -1,41 +1,5 @@
-// The renderer's inner loops: which triangle a pixel sees, and in what light.
+// The renderer's inner loop: which triangle a pixel sees.
 #include "triangle.h"
-
-static inline double dot(const double *one, const double *two) {
-    return one[0] * two[0] + one[1] * two[1] + one[2] * two[2];
-}
-
-// Unit normals (f, 3, 3) of faces' corners (f, 3), numbers of places: the mean of the `weighted`
-// normals (f, 3) of the faces about the same place whose unit normals (`facing`) have at least this
-// cosine to its own. `first` says where the faces about each place, and those about a last one
-// without any, end in the work array `sharers` (f, 3); it is changed to where they begin.
-struct mean_normals {
-    i64_2 corner;
-    i64_1 first;
-    i64_2 sharers;
-    f64_2 weighted, facing;
-    double cosine;
-    f32_3 out;
-};
-KERNEL(void, mean_normals) {
-    const int64_t *corner = a->corner.at, corners = 3 * a->corner.n[0];
-    int64_t *first = a->first.at, *sharers = a->sharers.at;
-    for (int64_t c = corners - 1; c >= 0; c--) sharers[--first[corner[c]]] = c / 3;
-    for (int64_t c = 0; c < corners; c++) {
-        const double *own = a->facing.at + 3 * (c / 3);
-        double x = 0, y = 0, z = 0;
-        for (int64_t n = first[corner[c]]; n < first[corner[c] + 1]; n++) {
-            if (!(dot(a->facing.at + 3 * sharers[n], own) > a->cosine)) continue;
-            const double *weighted = a->weighted.at + 3 * sharers[n];
-            x += weighted[0], y += weighted[1], z += weighted[2];
-        }
-        double length = sqrt(x * x + y * y + z * z);
-        length = length < 1e-12 ? 1e-12 : length;
-        float *normal = a->out.at + 3 * c;
-        normal[0] = (float)(x / length), normal[1] = (float)(y / length);
-        normal[2] = (float)(z / length);
-    }
-}
 
 // Widens the columns from `start` to `end` by where the edge from u, v is in row y.
 static inline void widen(
@@ -88,81 +52,28 @@ KERNEL(void, nearest) {
     }
 }
 
-// How much of each corner there is in a pixel of a triangle.
-static inline void shares(const float *seen, double x, double y, bool perspective, double *share) {
-    const float ua = seen[0], va = seen[1], na = seen[2], ub = seen[3], vb = seen[4], nb = seen[5];
-    const float uc = seen[6], vc = seen[7], nc = seen[8];
-    float area = (ub - ua) * (vc - va) - (vb - va) * (uc - ua);
-    double a = ((ub - x) * (vc - y) - (vb - y) * (uc - x)) / area;
-    double b = ((uc - x) * (va - y) - (vc - y) * (ua - x)) / area;
-    double c = 1 - a - b;
-    if (perspective) {
-        a *= na, b *= nb, c *= nc;
-        double whole = a + b + c;
-        a /= whole, b /= whole, c /= whole;
-    }
-    share[0] = a, share[1] = b, share[2] = c;
-}
-
-static inline void mix(const float *of, const double *share, double *mixed) {
-    for (int axis = 0; axis < 3; axis++)
-        mixed[axis] = share[0] * of[axis] + share[1] * of[3 + axis] + share[2] * of[6 + axis];
-}
-
-static inline double to_the_40th(double x) {
-    double to_2 = x * x, to_4 = to_2 * to_2, to_8 = to_4 * to_4, to_16 = to_8 * to_8;
-    return to_8 * (to_16 * to_16);
-}
-
-// Of many bodies, world frame, mm: each triangle's corners, their normals, and its colour.
-struct triangles { f32_3 corners, normals; f32_2 colors; };
-struct light { f32_1 sun, up; };  // a direction towards it, and one where the rest comes from
-struct eye { f32_1 place; int64_t perspective; };
-
-// Lays each pixel's triangle (-1: none) over what is there; a diffuse light, a little gloss. Seen
-// as in `nearest`.
-struct shade {
-    f32_3 picture;
-    i32_2 winner;
-    f32_3 seen;
-    struct triangles triangles;
-    struct light light;
-    struct eye eye;
-    double opacity;
-};
-KERNEL(void, shade) {
+// Lays each pixel's triangle (-1: none) over what is there: of its corners' red, green, blue and
+// cover (t, 3, 4) as much as there is of each in the pixel. Seen as in `nearest`.
+struct blend { f32_3 picture; i32_2 winner; f32_3 seen, colours; int64_t perspective; };
+KERNEL(void, blend) {
     const int64_t height = a->winner.n[0], width = a->winner.n[1], count = a->seen.n[0];
-    const float *place = a->eye.place.at, *lights = a->light.sun.at, *rest = a->light.up.at;
-    const double sun[3] = {lights[0], lights[1], lights[2]}, up[3] = {rest[0], rest[1], rest[2]};
     for (int64_t pixel = 0; pixel < height * width; pixel++) {
         const int64_t t = a->winner.at[pixel];
         if (t < 0 || t >= count) continue;
-        double share[3], spot[3], normal[3], view[3], half[3];
-        shares(
-            a->seen.at + 9 * t, (double)(pixel % width), (double)(pixel / width),
-            a->eye.perspective, share
-        );
-        mix(a->triangles.corners.at + 9 * t, share, spot);
-        mix(a->triangles.normals.at + 9 * t, share, normal);
-        for (int axis = 0; axis < 3; axis++) view[axis] = place[axis] - spot[axis];
-        double length = sqrt(dot(normal, normal)), far = 1 / sqrt(dot(view, view));
-        double scale = 1 / (length < 1e-12 ? 1e-12 : length);
-        double toward = dot(normal, view) * far * scale;
-        scale = toward >= 0 ? scale : -scale;  // of a surface seen from behind
-        double lit = dot(normal, sun) * scale, gloss = 0;
-        lit = lit < 0 ? 0 : lit;
-        if (lit > 0) {  // about the direction half way between the light and the viewer
-            for (int axis = 0; axis < 3; axis++) half[axis] = sun[axis] + view[axis] * far;
-            gloss = dot(normal, half) * scale / sqrt(dot(half, half));
-            gloss = 0.16 * to_the_40th(gloss < 0 ? 0 : gloss);
-        }
-        double strength = 0.46 + 0.1 * dot(normal, up) * scale + 0.5 * lit;
-        double slant = 1 - fabs(toward);
-        double cover = a->opacity + (1 - a->opacity) * 0.75 * slant * slant;
-        for (int d = 0; d < 3; d++) {
-            double own = a->triangles.colors.at[3 * t + d] * strength + gloss;
-            float *value = a->picture.at + 3 * pixel + d;
-            *value = (float)(*value + cover * ((own > 1 ? 1 : own) - *value));
+        const double x = (double)(pixel % width), y = (double)(pixel / width);
+        const float *p = a->seen.at + 9 * t;
+        const double ua = p[0] - x, va = p[1] - y, ub = p[3] - x, vb = p[4] - y;
+        const double uc = p[6] - x, vc = p[7] - y;
+        double of_a = ub * vc - vb * uc, of_b = uc * va - vc * ua, of_c = ua * vb - va * ub;
+        if (a->perspective) of_a *= p[2], of_b *= p[5], of_c *= p[8];
+        const double whole = of_a + of_b + of_c;
+        const float *c = a->colours.at + 12 * t;
+        double mixed[4];
+        for (int n = 0; n < 4; n++)
+            mixed[n] = (of_a * c[n] + of_b * c[4 + n] + of_c * c[8 + n]) / whole;
+        for (int n = 0; n < 3; n++) {
+            float *value = a->picture.at + 3 * pixel + n;
+            *value = (float)(*value + mixed[3] * (mixed[n] - *value));
         }
     }
 }
