@@ -41,11 +41,10 @@ from tumortrack_lab.world.kidneys import random_anatomy
 from tumortrack_resection.arms.body import cell_urdf
 from tumortrack_resection.arms.config import CellConfig
 from tumortrack_resection.arms.procedure import search_bases
-from tumortrack_resection.check import electrode_poses
-from tumortrack_resection.checking import checked
+from tumortrack_resection.check import checked, electrode_poses
+from tumortrack_resection.drafts import exophytic_shares
 from tumortrack_resection.located import STAND_MM, of_estimate, table_under
 from tumortrack_resection.planning import below
-from tumortrack_resection.tumors import exophytic_shares
 from tumortrack_resection.values import Located, ResectionConfig, name_of
 
 _LEAST_SHARE = 0.3  # of a tumor, outside the organ

@@ -30,8 +30,8 @@ from tumortrack_lab.study.resection import (
     tidy_plans,
     truth,
 )
+from tumortrack_resection.drafts import plan_resection
 from tumortrack_resection.located import of_estimate
-from tumortrack_resection.resection import plan_resection
 from tumortrack_resection.values import ResectionConfig
 
 CAMERA_FROM_TABLE = rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 150.0]))

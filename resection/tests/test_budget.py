@@ -10,9 +10,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
-from msgspec.structs import replace as with_terms
 
 from cut_objects import swept, to_axes
 from live_objects import small_estimate, small_update
@@ -29,16 +27,14 @@ from tumortrack_resection.budget import (
     TOOL_MM,
     UNKNOWN_TRACKING_MM,
     ErrorBudget,
+    LiveBudget,
     checked_against,
     foreseen_mm,
-    kept_words,
     planned_budgets,
     tightest,
 )
+from tumortrack_resection.drafts import plan_resection
 from tumortrack_resection.facets import Tools
-from tumortrack_resection.live_budget import LiveBudget
-from tumortrack_resection.located import of_estimate
-from tumortrack_resection.resection import plan_resection
 from tumortrack_resection.ur_sink import OFF_MM
 from tumortrack_resection.values import (
     ELECTRODE,
@@ -79,17 +75,6 @@ def kept(least_mm: float, part="tumor_1", solid=ELECTRODE) -> Clearance:
     return Clearance(solid, part, least_mm, least_mm, "sweep 1", 1.0, (0.0, 0.0, 0.0))
 
 
-@given(st.tuples(*[millimetres] * 5), st.sampled_from(NAMES), st.floats(0.01, 20))
-def test_the_sum_grows_with_every_term_and_lies_between_the_largest_and_the_plain_sum(
-    values, name, more
-):
-    terms = dict(zip(NAMES, values, strict=True))
-    found = budget(**terms)
-    assert max(values) - 1e-9 <= found.sum_mm <= sum(values) + 1e-9
-    assert budget(**{**terms, name: terms[name] + more}).sum_mm > found.sum_mm
-    assert found.left_mm == pytest.approx(5 - found.sum_mm)
-
-
 def test_what_always_points_the_same_way_is_added_and_what_is_independent_in_quadrature():
     assert budget(motion_mm=3, lag_mm=4).sum_mm == 7
     assert budget(tracking_mm=2, hand_eye_mm=3, tool_mm=6).sum_mm == 7
@@ -103,21 +88,6 @@ def test_an_error_that_is_none_is_refused(name, bad):
         budget(**{name: bad})
     with pytest.raises(InputError, match="margin"):
         budget(math.nan)
-
-
-def test_two_millimetres_of_motion_and_3_6_of_tracking_do_not_go_into_a_margin_of_5():
-    over = budget(tracking_mm=3.6, motion_mm=2)
-    with pytest.raises(NoPlan, match=r"5\.6 mm of error, most of it tracking \(3\.6\).* 5\.0 mm"):
-        checked_against(planned(), [over], accept=False)
-    accepted = checked_against(planned(), [over], accept=True)
-    (note,) = [note for note in accepted.warnings if note.startswith(OVER_BUDGET)]
-    assert "5.6 mm" in note
-    assert accepted.notes[-1] == note
-    fits = checked_against(planned(), [with_terms(over, margin_mm=6.0)], accept=False)
-    assert fits.notes[-1].startswith("0.4 mm are left")
-    (unchecked,) = fits.warnings
-    assert unchecked.startswith(UNCHECKED)
-    assert [n for n in fits.notes[:-1] if n != unchecked] == list(planned().notes)
 
 
 def test_every_tumor_has_to_be_covered_and_the_tightest_is_told():
@@ -150,19 +120,6 @@ def test_what_is_just_covered_is(left_mm):
     else:
         (unchecked,) = checked_against(planned(), [just], accept=False).warnings
         assert unchecked.startswith(UNCHECKED)
-
-
-@pytest.mark.parametrize("margin_mm", [2.0, 5.0, 8.0])
-def test_a_plan_keeps_its_margin_and_no_more(margin_mm):
-    plan = plan_resection(seen(), ResectionConfig(margin_mm=margin_mm, most_healthy=1.0))
-    foreseen = foreseen_mm(plan, seen(), Tools())
-    assert foreseen["tumor_1"] == pytest.approx(margin_mm, abs=0.3)
-    (first,) = planned_budgets(plan, seen())
-    assert (first.part, first.margin_mm) == ("tumor_1", foreseen["tumor_1"])
-    # By dense points and straight lines
-    fine = sphere(TUMOR_MM, RADIUS_MM, finer=5).vertices_mm
-    slow = min(to_axes(fine, swept(cut)).min() for cut in plan.cuts) - Tools().radius_mm
-    assert foreseen["tumor_1"] == pytest.approx(slow, abs=0.2)
 
 
 def test_the_electrode_s_whole_length_counts():
@@ -205,11 +162,6 @@ def test_there_is_a_budget_for_every_tumor_the_planned_one_s_first():
     assert ("tracking" in first.assumed, "tracking" in other.assumed) == (False, True)
 
 
-def test_the_papers_method_keeps_nothing_below_the_tumor():
-    (found,) = planned_budgets(planned("published"), seen())
-    assert found.margin_mm < 0.5
-
-
 def test_what_nobody_states_is_assumed_and_named():
     (bare,) = planned_budgets(planned(), seen())
     assert set(bare.assumed) == {"tracking", "hand-eye", "tool"}
@@ -225,13 +177,8 @@ def test_what_nobody_states_is_assumed_and_named():
     assert [row[0] for row in rows[1:]] == [*TERMS, "together"]
     assert rows[1] == ["tracking", "4.5", *ErrorBound(4.53).words.split()]
     assert ["tracking", "8.0", "assumed"] in [line.split() for line in bare.table()]
-
-
-def test_the_bound_of_a_poor_estimate_is_assumed_to_hold():
-    poor = replace(seen(), bounds_mm={"tumor_1": 9.5}, doubt="it is seen through")
-    (found,) = planned_budgets(planned(), poor)
-    assert found.tracking_mm == 9.5
-    assert "tracking" in found.assumed
+    (poor,) = planned_budgets(planned(), replace(bound, doubt="it is seen through"))
+    assert (poor.tracking_mm, "tracking" in poor.assumed) == (4.53, True)
 
 
 def test_a_calibration_states_its_error_at_the_tumor(tmp_path):
@@ -295,14 +242,6 @@ def test_lag_is_the_tumors_speed_times_all_that_comes_late():
     assert live.now.lag_mm == 0
     live.add_up(update(3), off_mm=(5.0, 0.0, 0.0))
     assert live.now.lag_mm == 0
-
-
-def test_a_tumor_is_as_far_off_as_its_estimate_says():
-    live = Live(budget(20.0, tracking_mm=3.0))
-    live.add_up(update(0, tumor_1=5.5), 0.0)
-    assert (live.now.tracking_mm, live.now.assumed) == (5.5, ())
-    estimate = update(0, tumor_1=5.5, kidney=7.0).estimate
-    assert of_estimate(estimate).bounds_mm == {"tumor_1": 5.5, "tumor_2": 4.2}
 
 
 def test_a_camera_whose_clock_is_ahead_takes_nothing_off_the_lag():
@@ -373,21 +312,3 @@ def test_live_a_bound_that_is_lost_halts(margin_mm):
     live = Live(budget(20.0, tracking_mm=8.0, assumed=("tracking",)))
     assert live.add_up(replace(known, estimate=bounded(known.estimate)), 0.0, 20.0)[0] is None
     assert live.now.tracking_mm == UNKNOWN_TRACKING_MM
-
-
-def test_the_margin_in_words_is_the_one_that_is_kept():
-    plan = plan_resection(two(), ResectionConfig(tumor="tumor_1"))
-    words = kept_words(plan, {"tumor_1": 5.14, "tumor_2": 7.26, "artery": 0.0})
-    assert [mm in words for mm in ("5.1 mm", "5 mm asked", "7.3 from tumor_2", "0.0 from artery")]
-    assert "tumor_1" in words
-    deep = kept_words(plan, {"tumor_1": -3.25})
-    assert "3.2 mm into tumor_1" in deep
-
-
-def test_the_way_of_the_tip_alone_is_foreseen_of_the_papers_method():
-    plan = planned("published")
-    found = foreseen_mm(plan, seen(), Tools())["tumor_1"]
-    path = np.concatenate([cut.path_mm for cut in plan.cuts])
-    slow = np.linalg.norm(path - TUMOR_MM, axis=1).min() - RADIUS_MM
-    inside = slow if slow < 0 else slow - Tools().radius_mm
-    assert found == pytest.approx(inside, abs=0.4)

@@ -8,7 +8,6 @@ import trimesh
 from pytransform3d.urdf import UrdfTransformManager
 
 from tumortrack.core.errors import ArtifactError, InputError
-from tumortrack.core.geometry import rotation_onto
 from tumortrack.core.types import Mesh
 from tumortrack_resection import check
 from tumortrack_resection.arms.body import cell_urdf
@@ -97,18 +96,6 @@ def test_kinematics_are_those_of_another_library(tilt):
             np.testing.assert_allclose(turn, table_from_link[:3, :3], atol=1e-9)
 
 
-def test_solids_are_those_of_the_cell():
-    cell = UrdfCell(URDF)
-    assert [solid.name for solid in cell.solids] == list(SOLIDS)
-    bare = cell.solids[2]
-    assert bare.radius_mm == pytest.approx(ELECTRODE_RADIUS_MM)
-    tip, rear = cell.ends([bare], HOME[None])[0][0]
-    assert np.linalg.norm(tip - rear) == pytest.approx(CONFIG.electrode_mm)
-    for n, link in ((2, "cutter_tip"), (4, "holder_tip")):
-        first = cell.ends([cell.solids[n]], HOME[None])[0][0, 0]
-        np.testing.assert_allclose(first, cell.frames(link, HOME[None])[1][0], atol=1e-6)
-
-
 def test_poses_follow_on_each_other_closely_and_pass_through_all_samples():
     motions = wandering(np.random.default_rng(3))
     ends_mm, _ = electrode_poses(URDF, motions)
@@ -117,13 +104,6 @@ def test_poses_follow_on_each_other_closely_and_pass_through_all_samples():
         assert np.abs(ends_mm - electrode(joints)).max((1, 2)).min() < 1e-6
     coarse_mm, _ = electrode_poses(URDF, motions, 5.0)
     assert STEP_MM < np.linalg.norm(np.diff(coarse_mm, axis=0), axis=2).max() <= 5.0
-
-
-def test_a_whole_turn_that_ends_where_it_began_has_poses_between():
-    motions = Motions((stage("home", HOME, turned(JOINTS[0], 2 * np.pi)),))
-    ends_mm, _ = electrode_poses(URDF, motions)
-    assert np.linalg.norm(np.diff(ends_mm, axis=0), axis=2).max() <= STEP_MM
-    assert np.ptp(ends_mm[:, 0, 0]) > 1000
 
 
 def test_what_borders_on_a_cut_counts_as_cut():
@@ -227,22 +207,6 @@ def test_it_leaves_out_no_pose_that_counts(off_mm, monkeypatch):
     assert of(quick).energised_mm < 0 or off_mm > 0
 
 
-def test_the_end_of_a_long_part_counts_where_its_middle_is_nearer_before():
-    far = turned(JOINTS[0], 0.1)
-    start, end = electrode(HOME)[0] + [0.0, 0.0, 40.0], electrode(far)[0] + [0.0, 0.0, 10.0]
-    long = ellipsoid(np.zeros(3), [np.linalg.norm(end - start), 3.0, 3.0])
-    turn = rotation_onto(np.array([1.0, 0.0, 0.0]), end - start)
-    vessel = long.moved(long.vertices_mm @ turn.T + start)
-    found = of(
-        clearances(URDF, Motions((stage("home", HOME, far),)), {"vein": vessel}, ()), part="vein"
-    )
-    last = of(clearances(URDF, Motions((stage("hold", far),)), {"vein": vessel}, ()), part="vein")
-    assert found.least_mm == pytest.approx(last.least_mm, abs=0.01)
-    assert last.least_mm < 10.0
-    first = of(clearances(URDF, Motions((stage("hold", HOME),)), {"vein": vessel}, ()), part="vein")
-    assert first.least_mm > 15.0
-
-
 def test_flat_ends_are_flat():
     tip, rear = electrode(HOME)
     along = (tip - rear) / np.linalg.norm(tip - rear)
@@ -255,14 +219,6 @@ def test_flat_ends_are_flat():
 
 
 # Depth --------------------------------------------------------------------------------------------
-
-
-def test_an_electrode_wholly_inside_is_as_deep_as_its_deepest_point():
-    middle = electrode(HOME).mean(0)
-    tumor = ellipsoid(middle + [0.0, 0.0, 10.0], [60.0] * 3, 4)
-    for motions in (stage("hold", HOME), stage("sweep 1", HOME, turned(JOINTS[0], 0.01))):
-        found = of(clearances(URDF, Motions((motions,)), {"tumor_1": tumor}, ()))
-        assert found.least_mm == pytest.approx(-50.0, abs=0.4)
 
 
 def test_a_plunge_and_a_cut_inside_that_crosses_nothing_is_deep():
@@ -337,16 +293,6 @@ def test_what_is_carried_moves_with_the_holder_from_the_lift_on():
     assert arriving.least_mm == pytest.approx(unmoved.least_mm, abs=2e-3)
     moved = Motions((stage("pull", HOME, up),))
     assert of(clearances(URDF, moved, parts, ["tumor_1"])).least_mm == pytest.approx(apart_mm)
-
-
-def test_a_carried_part_keeps_its_distance_from_the_cup():
-    cup = UrdfCell(URDF).ends(UrdfCell(URDF).solids[4:], HOME[None])[0][0]
-    tumor = ellipsoid(cup[0] + (cup[0] - cup[1]) / 2, [6.0] * 3)
-    lifting = Motions((stage("lift", HOME, turned("holder_wrist_1_joint", 0.5)),))
-    still = of(clearances(URDF, Motions((stage("hold", HOME),)), {"t": tumor}, ()), "cup", "t")
-    carried = of(clearances(URDF, lifting, {"t": tumor}, ["t"]), "cup", "t")
-    assert carried.least_mm == pytest.approx(still.least_mm, abs=1e-3)
-    assert 0 < carried.least_mm < CONFIG.cup_mm
 
 
 def test_cutting_and_not_cutting_are_told_apart():
@@ -482,3 +428,10 @@ def test_what_cannot_be_checked_is_refused():
     ):
         with pytest.raises(InputError):
             clearances(URDF, motions, parts, carried)
+
+
+def test_a_whole_turn_that_ends_where_it_began_has_poses_between():
+    motions = Motions((stage("home", HOME, turned(JOINTS[0], 2 * np.pi)),))
+    ends_mm, _ = electrode_poses(URDF, motions)
+    assert np.linalg.norm(np.diff(ends_mm, axis=0), axis=2).max() <= STEP_MM
+    assert np.ptp(ends_mm[:, 0, 0]) > 1000

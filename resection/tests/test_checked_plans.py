@@ -1,8 +1,9 @@
-"""Random organs, tumors and cells: whatever is not refused keeps its distances, by a slow check of
-its own as well; and motions that were tampered with are refused."""
+"""Random organs, tumors and cells: whatever is not refused keeps its distances; and motions that
+were tampered with are refused."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -14,25 +15,18 @@ from hypothesis import HealthCheck, Phase, assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cut_objects import beyond, in_box, in_plane, on_axes, swept, to_axes
+from cut_objects import holds, keeps
 from plan_objects import located_of, sphere, united
-from slow_check import least_mm
 from tumortrack.core.errors import NoPlan
-from tumortrack.core.mesh_query import contains
-from tumortrack.core.types import Anatomy, Mesh
-from tumortrack_lab.cut import cut as cut_out
+from tumortrack.core.types import Mesh
 from tumortrack_resection.arms.body import cell_urdf
 from tumortrack_resection.arms.config import Base, CellConfig
 from tumortrack_resection.arms.procedure import plan_motions
 from tumortrack_resection.arms.trajectory import first_hit
-from tumortrack_resection.budget import foreseen_mm
-from tumortrack_resection.check import TOLERANCE_MM, clearances
-from tumortrack_resection.checking import checked
+from tumortrack_resection.check import TOLERANCE_MM, checked, clearances
+from tumortrack_resection.drafts import plan_resection
 from tumortrack_resection.motions import Motions, MotionStage
-from tumortrack_resection.resection import plan_resection
-from tumortrack_resection.values import Located, ResectionConfig, ResectionPlan, name_of
-
-AGREES_MM = 0.05
+from tumortrack_resection.values import Located, ResectionConfig, ResectionPlan
 
 
 class Case(NamedTuple):
@@ -127,47 +121,18 @@ def many(count: int, of: st.SearchStrategy[Case]) -> Callable[[Callable[[Case], 
     return run
 
 
-def keeps(plan: ResectionPlan) -> dict[str, float]:
-    return {**dict.fromkeys(plan.taken, plan.margin_mm), **plan.keep_mm}
-
-
 def plan_keeps_what_it_says(case: Case) -> bool:
-    """Without arms: distances along the lines, what they cut, and whether the piece comes away."""
-    located, config, tools = case.located, case.config, case.cell.tools
+    """Without arms."""
     try:
-        plan = plan_resection(located, config, tools)
+        plan = plan_resection(case.located, case.config, case.cell.tools)
     except NoPlan:
         return False
-    assert len(plan.facets) <= config.most_facets
-    assert {name_of(n) for n in located.tumors} == set(keeps(plan))
-    foreseen = foreseen_mm(plan, located, tools)
-    lines = [swept(cut, tools.electrode_mm) for cut in plan.cuts]
-    for name, mm in keeps(plan).items():
-        points = located.meshes[name].spread_mm(1.0)
-        gap = min(to_axes(points, ends).min() for ends in lines) - tools.radius_mm
-        assert gap > mm - TOLERANCE_MM / 2
-        assert foreseen[name] == pytest.approx(gap, abs=0.3)
-    for number, (ends, plane) in enumerate(zip(lines, plan.facets, strict=True)):
-        others = np.delete(plan.facets, number, axis=0)
-        assert np.abs(beyond(plane[None], ends.reshape(-1, 3))).max() < 1e-6
-        cut = on_axes(ends).reshape(-1, 3)
-        cut = cut[in_box(located.organ, cut)]
-        cut = cut[contains(located.organ, cut)]
-        assert beyond(others, cut).max(initial=0) < 1.5
-        wall = in_plane(plane, located.organ)
-        wall = wall[in_box(located.organ, wall) & (beyond(others, wall) <= 0).all(1)]
-        wall = wall[contains(located.organ, wall)]
-        assert to_axes(wall, ends).max(initial=0) < tools.radius_mm
-    parts = [located.meshes[name_of(n)] for n in located.tumors]
-    done = cut_out(Anatomy((located.organ, *parts)), plan, voxel_mm=0.7)
-    assert done.detached
-    assert (done.removed_share, done.cut_share, done.hurt) == (1.0, 0.0, ())
-    assert (plan.facets[:, :3] @ plan.lift).max() < 0
+    holds(plan, case.located, case.config, case.cell.tools)
     return True
 
 
 def arms_keep_what_was_planned(case: Case) -> bool:
-    """Motions pass the check, which agrees with the slow one."""
+    """Motions pass the check."""
     try:
         plan, motions = plan_motions(*case)
     except NoPlan:
@@ -178,9 +143,6 @@ def arms_keep_what_was_planned(case: Case) -> bool:
     assert set(found.least_mm) == set(keeps(plan))
     for name, mm in keeps(plan).items():
         assert found.least_mm[name] >= mm - TOLERANCE_MM
-        mesh, carried = case.located.meshes[name], name in plan.taken
-        slow = least_mm(urdf, motions, mesh, case.cell.electrode_mm, carried)
-        assert found.least_mm[name] == pytest.approx(slow, abs=AGREES_MM)
     return True
 
 
@@ -230,58 +192,21 @@ def with_joint(motions: Motions, stage: str, joint: int, by_rad: np.ndarray | fl
     return Motions(tuple(stages))
 
 
-def slowly(motions: Motions, name: str, plan: ResectionPlan, located: Located) -> float:
-    mesh, carried = located.meshes[name], name in plan.taken
-    return least_mm(URDF, motions, mesh, CELL.electrode_mm, carried)
-
-
-def test_motions_as_they_were_planned_are_not_refused():
+def test_motions_are_refused_only_where_they_come_too_near():
     located, plan, motions = made()
     found = checked(plan, motions, URDF, located)
-    for name, mm in keeps(plan).items():
-        slow = slowly(motions, name, plan, located)
-        assert found.least_mm[name] == pytest.approx(slow, abs=AGREES_MM)
-        assert slow >= mm
-
-
-@pytest.mark.parametrize("number", [1, 2, 3])
-def test_a_sweep_with_a_joint_off_is_refused_where_the_electrode_comes_nearer(number):
-    located, plan, motions = made()
-    name = f"sweep {number}"
-    (sweep,) = [stage for stage in motions.stages if stage.name == name]
-    needs, refused = keeps(plan), 0
-    for joint in (0, 1, 4):
-        for by_rad in (-0.004, 0.004):
-            alone = with_joint(Motions((sweep,)), name, joint, by_rad)
-            lacking = [
-                mm - slowly(alone, part, plan, located) for part, mm in needs.items()
-            ]  # fmt: skip
-            if max(lacking) < TOLERANCE_MM + AGREES_MM:
-                continue
-            refused += 1
-            with pytest.raises(NoPlan, match="electrode"):
-                checked(plan, with_joint(motions, name, joint, by_rad), URDF, located)
-    assert refused >= 2
-
-
-def test_a_single_sample_off_is_refused():
-    """A twitch of 20 ms while it cuts, towards the tumor."""
-    located, plan, motions = made()
+    assert all(found.least_mm[name] >= mm for name, mm in keeps(plan).items())
     sweep = next(stage for stage in motions.stages if stage.name == "sweep 1")
-    middle = int(np.flatnonzero(sweep.cutting).mean())
-    twitch = np.zeros(len(sweep.times_s))
-    twitch[middle] = 0.01
-    for joint in (0, 1, 2):
-        for sign in (-1, 1):
-            odd = with_joint(motions, "sweep 1", joint, sign * twitch)
-            near = min(
-                slowly(odd, part, plan, located) - mm for part, mm in keeps(plan).items()
-            )  # fmt: skip
-            if near < -TOLERANCE_MM - AGREES_MM:
-                with pytest.raises(NoPlan, match="electrode"):
-                    checked(plan, odd, URDF, located)
-                return
-    raise AssertionError("no joint brings it nearer")
+    twitch = np.zeros(len(sweep.times_s))  # of 20 ms while it cuts
+    twitch[int(np.flatnonzero(sweep.cutting).mean())] = 0.01
+    for by_rad in (0.01, twitch):
+        refused = 0
+        for joint, sign in itertools.product((0, 1, 2), (-1, 1)):
+            try:
+                checked(plan, with_joint(motions, "sweep 1", joint, sign * by_rad), URDF, located)
+            except NoPlan:
+                refused += 1
+        assert refused >= 2  # a centimetre towards the tumor, by either way
 
 
 def test_motions_of_another_organ_are_refused():

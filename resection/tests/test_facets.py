@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from cut_objects import beyond, in_box, in_plane, on_axes, swept, to_axes
+from cut_objects import beyond, gap_mm, holds, on_axes, swept
 from plan_objects import (
     HALF_MM,
     MIDDLE_MM,
@@ -22,10 +22,9 @@ from plan_objects import (
 )
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.mesh_query import contains
-from tumortrack.core.types import Anatomy, Mesh
-from tumortrack_lab.cut import cut as cut_out
+from tumortrack.core.types import Mesh
+from tumortrack_resection.drafts import plan_resection
 from tumortrack_resection.facets import Tools
-from tumortrack_resection.resection import plan_resection
 from tumortrack_resection.values import (
     NO_ROOM,
     UNGUARDED,
@@ -37,9 +36,7 @@ from tumortrack_resection.values import (
 
 OURS = ResectionConfig()
 RADIUS = Tools().radius_mm  # of the electrode
-SLACK_MM = 0.1  # by which planes may lie farther off than they have to
 BODY = sphere(MIDDLE_MM, HALF_MM)
-NEAR_MM = 0.3  # of a plane
 
 
 def turned(seen: Located, vector: tuple[float, float, float]) -> Located:
@@ -92,94 +89,23 @@ def planned(name: str) -> ResectionPlan:
 IN_ALL = pytest.mark.parametrize("name", SCENES)
 
 
-def dense(mesh: Mesh) -> np.ndarray:
-    return mesh.spread_mm(1.0)  # 5 mm are at most 0.04 mm too long
-
-
-# What is kept -------------------------------------------------------------------------------------
-
-
 @IN_ALL
-def test_the_whole_tumor_lies_inside_all_planes_by_margin_and_radius_and_hardly_more(name):
-    seen, plan = scene(name), planned(name)
-    assert np.linalg.norm(plan.facets[:, :3], axis=1) == pytest.approx(1.0, abs=1e-12)
-    depths = -beyond(plan.facets, seen.meshes[plan.tumor].vertices_mm).max(0)
-    assert (depths >= plan.margin_mm + RADIUS - 1e-9).all()
-    assert (depths <= plan.margin_mm + RADIUS + SLACK_MM + 1e-9).all()
-
-
-@IN_ALL
-def test_the_electrode_lies_in_its_facet_and_so_near_to_nothing(name):
-    """Its whole length, all along the cut: distances of dense points of surfaces."""
-    seen, plan = scene(name), planned(name)
-    assert [cut.sweep for cut in plan.cuts] == [*range(1, len(plan.facets) + 1)]
-    surfaces = {**seen.meshes, **seen.structures}
-    kept = {**dict.fromkeys(plan.taken, plan.margin_mm), **plan.keep_mm}
-    for cut, plane in zip(plan.cuts, plan.facets, strict=True):
-        ends = swept(cut)
-        assert np.linalg.norm(cut.axis) == pytest.approx(1.0, abs=1e-12)
-        assert np.abs(beyond(plane[None], ends.reshape(-1, 3))).max() < 1e-6
-        for other, least_mm in kept.items():
-            gaps = to_axes(dense(surfaces[other]), ends) - RADIUS
-            assert gaps.min() > least_mm - (0.0 if other == plan.tumor else 0.1), other
+def test_what_a_plan_says_it_keeps_cuts_and_takes_away(name):
+    holds(planned(name), scene(name), KEEPING.get(name, OURS), Tools())
 
 
 def test_everything_that_is_to_be_kept_is_named():
     assert planned("side").keep_mm == {}
     assert planned("a second tumor").keep_mm == {"tumor_2": OURS.margin_mm}
+    assert planned("a second tumor").taken == ("tumor_1",)
     assert planned("an artery").keep_mm == {"artery": 3.0}
     assert not any(note.startswith(UNGUARDED) for note in planned("an artery").notes)
     unguarded = plan_resection(scene("an artery"), OURS)
     assert unguarded.keep_mm == {}
     (note,) = [note for note in unguarded.warnings if note.startswith(UNGUARDED)]
     assert "artery" in note
-
-
-@IN_ALL
-def test_the_electrode_cuts_nothing_but_the_facet(name):
-    seen, plan = scene(name), planned(name)
-    for number, cut in enumerate(plan.cuts):
-        points = on_axes(swept(cut)).reshape(-1, 3)
-        points = points[in_box(seen.organ, points)]
-        points = points[contains(seen.organ, points)]
-        others = np.delete(plan.facets, number, axis=0)
-        assert len(points)
-        assert beyond(others, points).max(initial=0) < 1.5
-
-
-# What comes away ----------------------------------------------------------------------------------
-
-
-@IN_ALL
-def test_the_sweeps_leave_no_bridge_between_the_piece_and_what_stays(name):
-    """Of the organ, all that lies near to a plane and within the others is in a kerf."""
-    seen, plan = scene(name), planned(name)
-    for number, (cut, plane) in enumerate(zip(plan.cuts, plan.facets, strict=True)):
-        ends, others = swept(cut), np.delete(plan.facets, number, axis=0)
-        for off_mm in (-NEAR_MM, 0.0, NEAR_MM):
-            points = in_plane(plane + [0, 0, 0, off_mm], seen.organ)
-            points = points[in_box(seen.organ, points)]
-            points = points[(beyond(others, points) <= 0).all(1)]
-            points = points[contains(seen.organ, points)]
-            assert to_axes(points, ends).max(initial=0) < RADIUS
-
-
-@IN_ALL
-def test_strokes_begin_and_end_outside_the_organ(name):
-    seen, plan = scene(name), planned(name)
-    for cut in plan.cuts:
-        ends = on_axes(swept(cut)[[0, -1]], 0.5).reshape(-1, 3)
-        assert not contains(seen.organ, ends).any()
-        steps = np.linalg.norm(np.diff(cut.path_mm, axis=0), axis=1)
-        assert steps.max() <= OURS.spacing_mm + 1e-9
-
-
-@IN_ALL
-def test_the_electrode_s_bare_length_reaches_through_the_organ(name):
-    seen, plan = scene(name), planned(name)
-    for cut in plan.cuts:
-        rear = swept(cut, Tools().electrode_mm - 4.0)[:, 1]
-        assert not contains(seen.organ, rear).any()
+    without = plan_resection(replace(scene("an artery"), structures={}), OURS)
+    assert np.array_equal(unguarded.facets, without.facets)  # it is named, and nothing else
 
 
 @IN_ALL
@@ -217,48 +143,16 @@ def counted_to(ml: dict[str, float], part_ml: float, count: int) -> float:
 
 
 @IN_ALL
-def test_voxels_of_the_organ_fall_apart_into_the_piece_and_what_stays(name):
-    seen, plan = scene(name), planned(name)
-    tumors = [seen.meshes[name_of(label)] for label in seen.tumors]
-    done = cut_out(Anatomy((seen.organ, *tumors)), plan, voxel_mm=0.7)
-    assert done.detached
-    assert (done.removed_share, done.cut_share, done.left_share) == (1.0, 0.0, 0.0)
-    assert done.hurt == ()
-    assert plan.margin_mm <= done.margin_mm < plan.margin_mm + 0.3
-    assert done.piece_ml == pytest.approx(plan.piece.volume_ml, rel=0.03)
-
-
-@pytest.mark.parametrize("spacing_mm", [0.5, 1.0, 2.0])
-def test_however_far_apart_points_of_strokes_are_the_piece_comes_free(spacing_mm):
-    seen = scene("side")
-    plan = plan_resection(seen, ResectionConfig(spacing_mm=spacing_mm))
-    for number, (cut, plane) in enumerate(zip(plan.cuts, plan.facets, strict=True)):
-        others = np.delete(plan.facets, number, axis=0)
-        wall = in_plane(plane, seen.organ)
-        wall = wall[in_box(seen.organ, wall) & (beyond(others, wall) <= 0).all(1)]
-        wall = wall[contains(seen.organ, wall)]
-        assert to_axes(wall, swept(cut)).max(initial=0) < RADIUS
-
-
-@IN_ALL
-def test_the_piece_comes_free_the_way_it_is_lifted_and_the_cup_comes(name):
-    plan = planned(name)
-    assert np.linalg.norm(plan.lift) == pytest.approx(1.0)
-    assert plan.lift[2] >= 0
-    assert (plan.facets[:, :3] @ plan.lift).max() < -0.04
-
-
-@IN_ALL
 def test_it_is_held_on_the_piece_and_on_the_side_from_which_the_cup_comes(name):
     seen, plan = scene(name), planned(name)
-    gap, _ = cKDTree(dense(seen.organ)).query(plan.grasp_mm)
+    gap, _ = cKDTree(seen.organ.spread_mm(1.0)).query(plan.grasp_mm)
     assert gap < 1.8  # it is the highest point of a column 2 mm wide
     assert (beyond(plan.facets, plan.grasp_mm[None]) <= -RADIUS - 4.0).all()
     above = plan.grasp_mm + np.arange(3.0, 120.0, 1.0)[:, None] * plan.lift
     assert not contains(seen.organ, above).any()
     for label in seen.tumors:
         if name_of(label) not in plan.taken:
-            off = np.linalg.norm(dense(seen.meshes[name_of(label)]) - plan.grasp_mm, axis=1)
+            off = np.linalg.norm(seen.meshes[name_of(label)].spread_mm(1.0) - plan.grasp_mm, axis=1)
             assert off.min() > Tools().cup_radius_mm
 
 
@@ -275,37 +169,6 @@ def test_what_can_be_cut_with_few_facets_can_be_with_more_and_takes_no_more(name
         lost.append(plan.volumes_ml["healthy"] + plan.volumes_ml["kerf"])
     assert all(after <= 1.3 * before for before, after in itertools.pairwise(lost))
     assert lost[-1] < 0.7 * lost[0]
-
-
-def test_a_wider_margin_takes_more():
-    healthy = []
-    for margin_mm in (1.0, 3.0, 5.0, 8.0):
-        plan = plan_resection(scene("side"), ResectionConfig(margin_mm=margin_mm))
-        depths = -beyond(plan.facets, scene("side").meshes["tumor_1"].vertices_mm).max(0)
-        assert depths == pytest.approx(margin_mm + RADIUS + SLACK_MM)
-        healthy.append(plan.volumes_ml["healthy"])
-    assert healthy == sorted(healthy)
-    assert healthy[-1] > 2 * healthy[0]
-
-
-def test_the_same_input_has_the_same_plan():
-    one, other = (plan_resection(located(n=12_000), OURS) for _ in range(2))
-    for name in ("facets", "grasp_mm", "lift"):
-        assert np.array_equal(getattr(one, name), getattr(other, name))
-    for a, b in zip(one.cuts, other.cuts, strict=True):
-        assert np.array_equal(a.path_mm, b.path_mm)
-        assert np.array_equal(a.axis, b.axis)
-    assert np.array_equal(one.piece.vertices_mm, other.piece.vertices_mm)
-    assert (one.volumes_ml, one.notes) == (other.volumes_ml, other.notes)
-
-
-@pytest.mark.parametrize("most_healthy", [0.02, 0.05])
-def test_too_much_healthy_tissue_is_no_plan(most_healthy):
-    with pytest.raises(NoPlan, match=f"{most_healthy:.0%}"):
-        plan_resection(scene("side"), ResectionConfig(most_healthy=most_healthy))
-    plan = planned("side")
-    lost = plan.volumes_ml["healthy"] + plan.volumes_ml["kerf"]
-    assert 0.05 < lost / plan.volumes_ml["parenchyma"] < 0.5
 
 
 # The electrode's length ---------------------------------------------------------------------------
@@ -327,17 +190,6 @@ def test_an_electrode_that_is_too_short_is_refused_and_one_that_is_long_enough_i
 # Other tumors -------------------------------------------------------------------------------------
 
 
-def test_where_there_is_room_the_other_tumor_keeps_the_whole_margin():
-    plan = planned("a second tumor")
-    assert plan.taken == ("tumor_1",)
-    assert not any(note.startswith(NO_ROOM) for note in plan.notes)
-
-
-def gap_mm(plan: ResectionPlan, seen: Located, other: str) -> float:
-    points = dense(seen.meshes[other])
-    return min(to_axes(points, swept(cut)).min() for cut in plan.cuts) - RADIUS
-
-
 def apart(gap_mm: float, other_mm: float = 12.0) -> Located:
     """A small tumor on the organ's side, and so far beside it a large one."""
     one, way = np.array([-20.0, -24.0, 150.0]), np.array([0.99875, 0.05, 0.0])
@@ -355,8 +207,8 @@ def test_where_there_is_little_room_it_keeps_less_and_the_plan_says_so(apart_mm,
     assert plan.keep_mm == {"tumor_2": pytest.approx(share * OURS.margin_mm)}
     (note,) = [note for note in plan.warnings if note.startswith(NO_ROOM)]
     assert "tumor_2" in note
-    assert plan.keep_mm["tumor_2"] - 0.1 < gap_mm(plan, seen, "tumor_2") < OURS.margin_mm
-    assert gap_mm(plan, seen, "tumor_1") >= OURS.margin_mm
+    assert plan.keep_mm["tumor_2"] - 0.1 < gap_mm(plan, seen.meshes["tumor_2"]) < OURS.margin_mm
+    assert gap_mm(plan, seen.meshes["tumor_1"]) >= OURS.margin_mm
     # With the whole margin there is none.
     asked = ResectionConfig(tumor="tumor_1", keep_away={"tumor_2": share * OURS.margin_mm})
     less = plan_resection(seen, asked)
@@ -377,28 +229,11 @@ def test_tumors_too_near_to_be_cut_apart_come_away_together():
     assert plan.volumes_ml["piece"] == pytest.approx(plan.volumes_ml["healthy"] + with_it)
 
 
-def test_a_tumor_that_the_piece_swallows_is_named_and_keeps_its_distance():
-    seen = beside(TUMOR_MM + [0.0, 14.0, 0.0], 1.8)
-    plan = plan_resection(seen, ResectionConfig(tumor="tumor_1", margin_mm=8.0))
-    assert plan.taken == ("tumor_1", "tumor_2")
-    assert any("tumor_2" in note for note in plan.notes)
-    assert gap_mm(plan, seen, "tumor_2") > 8.0 - 0.1
-
-
-@pytest.mark.parametrize("mm", [3.0, 8.0])
-def test_another_tumor_keeps_the_distance_that_is_asked_for(mm):
-    seen = beside([-24, -18, 158])
-    plan = plan_resection(seen, ResectionConfig(tumor="tumor_1", keep_away={"tumor_2": mm}))
-    assert plan.keep_mm == {"tumor_2": mm}
-    assert plan.taken == ("tumor_1",)
-    assert gap_mm(plan, seen, "tumor_2") > mm - 0.1
-
-
 def test_the_first_tumor_keeps_the_distance_that_is_asked_for_when_the_second_is_cut_out():
     both = ResectionConfig(tumor="tumor_2", keep_away={"tumor_1": 3.0})
     plan = plan_resection(scene("a second tumor"), both)
     assert (plan.tumor, plan.keep_mm) == ("tumor_2", {"tumor_1": 3.0})
-    assert gap_mm(plan, scene("a second tumor"), "tumor_1") > 3.0 - 0.1
+    assert gap_mm(plan, scene("a second tumor").meshes["tumor_1"]) > 3.0 - 0.1
     with pytest.raises(InputError, match="--keep-away tumor_1"):
         plan_resection(scene("side"), ResectionConfig(keep_away={"tumor_1": 3.0}))
 
@@ -411,3 +246,61 @@ def test_between_tumors_that_touch_there_is_no_way():
     lost = (alone.volumes_ml["healthy"] + alone.volumes_ml["kerf"]) / alone.volumes_ml["parenchyma"]
     with pytest.raises(NoPlan):
         plan_resection(seen, ResectionConfig(tumor="tumor_1", most_healthy=lost / 4))
+
+
+# Structures, and other things to keep away from ---------------------------------------------------
+
+
+def with_artery(off_mm: float) -> Located:
+    """A ball of 1 mm radius in the organ, so far beyond the margin."""
+    away = RADIUS_MM + OURS.margin_mm + off_mm + 1.0
+    ball = sphere(TUMOR_MM + [0.0, away, 0.0], 1.0)
+    return replace(located(n=12_000), structures={"artery": ball})
+
+
+@pytest.mark.parametrize("off_mm", [0.0, 3.0, 12.0])
+@pytest.mark.parametrize("keep_mm", [1.0, 5.0])
+def test_cuts_keep_the_distance_from_a_structure(off_mm, keep_mm):
+    """Beside it or beyond it: the piece is another where it lies in the way."""
+    seen = with_artery(off_mm)
+    plan = plan_resection(seen, ResectionConfig(keep_away={"artery": keep_mm}))
+    assert plan.keep_mm == {"artery": keep_mm}
+    assert gap_mm(plan, seen.structures["artery"]) > keep_mm - 0.05
+    assert gap_mm(plan, seen.meshes["tumor_1"]) >= OURS.margin_mm
+
+
+def test_a_structure_round_the_tumor_is_no_plan_by_its_name():
+    seen = replace(located(n=12_000), structures={"vein": sphere(TUMOR_MM, RADIUS_MM + 5.0)})
+    with pytest.raises(NoPlan, match="vein"):
+        plan_resection(seen, ResectionConfig(keep_away={"vein": 3.0}))
+
+
+def test_an_open_structure_keeps_its_distance_too():
+    """It crosses the edges between facets."""
+    corners = TUMOR_MM + np.array([[-30.0, 22, -30], [30, 22, -30], [30, 22, 30], [-30, 22, 30]])
+    sheet = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    seen = replace(located(), structures={"fascia": sheet})
+    plan = plan_resection(seen, ResectionConfig(keep_away={"fascia": 1.0}))
+    assert gap_mm(plan, sheet) > 1.0 - 0.05
+
+
+def test_what_cannot_be_kept_away_from_is_refused():
+    with pytest.raises(InputError, match=r"--keep-away vein.* artery"):
+        plan_resection(with_artery(2.0), ResectionConfig(keep_away={"vein": 3.0}))
+    with pytest.raises(InputError, match=r"--keep-away tumor_2"):
+        plan_resection(with_artery(2.0), ResectionConfig(keep_away={"tumor_2": 3.0}))
+    for mm in (0.0, -1.0, 51.0, float("nan")):
+        with pytest.raises(InputError, match="keep_away"):
+            ResectionConfig(keep_away={"artery": mm})
+
+
+def test_a_tumor_with_a_surface_and_no_points_is_kept_away_from():
+    """As of a tumor that is smaller than the spacing of the cloud's points."""
+    seen = located(sphere(TUMOR_MM, RADIUS_MM), n=12_000)
+    ball = sphere(TUMOR_MM + [0.0, RADIUS_MM + OURS.margin_mm + 6.0, 0.0], 1.0)
+    seen = replace(seen, meshes={**seen.meshes, "tumor_2": ball})
+    assert seen.tumors == (2, 3)
+    plan = plan_resection(seen, ResectionConfig(tumor="tumor_1", keep_away={"tumor_2": 2.0}))
+    assert gap_mm(plan, ball) > 2.0 - 0.05
+    with pytest.raises(NoPlan):
+        plan_resection(seen, ResectionConfig(tumor="tumor_2"))

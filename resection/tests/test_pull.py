@@ -5,54 +5,36 @@ from __future__ import annotations
 import json
 from concurrent.futures import Future
 from dataclasses import replace
-from functools import partial
 
 import msgspec
 import numpy as np
 import pytest
-import trimesh
-from PIL import Image
 
 from live_objects import small_estimate, small_update
 from plan_objects import Deviating, located, sphere
 from reports import reporting
-from stories import answered, looking_down, succeeded, tumortrack
-from tumortrack.assessment import advice as advice_module
-from tumortrack.assessment import bound
+from stories import answered, succeeded, tumortrack
 from tumortrack.core import store
 from tumortrack.core.errors import NoPlan
-from tumortrack.core.evidence import Held
 from tumortrack.core.geometry import transform_points
-from tumortrack.core.types import SensorCloud
+from tumortrack.core.report import NextEvidence
 from tumortrack.imaging.case import load_case
 from tumortrack.live.spec import SOURCES
 from tumortrack.live.values import PublishedFrame
 from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.sense.region import Hints, organ_points
-from tumortrack.tracking.model_files import load_model
-from tumortrack.tracking.tracker import Tracker, region_for
+from tumortrack.tracking.tracker import region_for
 from tumortrack_devices.pulled import PulledStates
 from tumortrack_resection.arms import procedure as arms_procedure
 from tumortrack_resection.arms.body import cell_urdf
 from tumortrack_resection.arms.cell import ArmCell
-from tumortrack_resection.arms.config import Base, CellConfig
+from tumortrack_resection.arms.config import CellConfig
 from tumortrack_resection.arms.procedure import plan_motions
-from tumortrack_resection.arms.reach import ArmsReach
 from tumortrack_resection.budget import ErrorBudget
+from tumortrack_resection.drafts import plan_resection
 from tumortrack_resection.files import PlanFolder, read_plan, write_plan
-from tumortrack_resection.grip import Grip, held_std_mm
-from tumortrack_resection.motions import (
-    ABORTED,
-    HOLD,
-    HOLDER,
-    LIFT,
-    PULL,
-    TAUT,
-    Execution,
-    Halt,
-    Motions,
-    MotionStage,
-)
+from tumortrack_resection.grip import Grip
+from tumortrack_resection.motions import HOLDER, Execution, Motions, MotionStage, Stage
 from tumortrack_resection.operation import (
     Following,
     Operation,
@@ -60,13 +42,12 @@ from tumortrack_resection.operation import (
     Planned,
     ResectionProgress,
 )
-from tumortrack_resection.resection import plan_resection
 from tumortrack_resection.values import ResectionConfig
 
-STATES = ("approach", "grasp", "hold", PULL, TAUT, "sweep 1", LIFT, "release", "home")
-GRIPPING = (PULL, TAUT, "sweep 1")
+FIRST, LAST = ("approach", "grasp", "hold", "pull", "taut"), ("lift", "release", "home")
+STATES = (*FIRST, "sweep 1", *LAST)
+GRIPPING = (Stage.PULL, Stage.TAUT, "sweep 1")
 PULL_MM = 4.0
-FAR = Base(position_mm=(5000.0, 0.0, 100.0), yaw_deg=0.0)
 LOCATED = located(sphere((12.0, -14.0, 165.0), 10.0), n=6_000)
 PLAN = plan_resection(LOCATED, ResectionConfig(method="published"))
 FRAMES = PublishedFrame(
@@ -77,7 +58,7 @@ CAMERA_FROM_TABLE = np.linalg.inv(FRAMES.published_from_camera)
 
 def motions(states=STATES):
     """The holder's first joint is its tip's height (mm): up by the pull, and far at the lift."""
-    ends, here, stages = {PULL: PULL_MM, LIFT: 60.0}, 0.0, []
+    ends, here, stages = {Stage.PULL: PULL_MM, Stage.LIFT: 60.0}, 0.0, []
     for name in states:
         there, joints = ends.get(name, here), np.zeros((2, 12))
         joints[:, 6], here = (here, there), there
@@ -132,7 +113,7 @@ def test_what_the_cup_holds_is_evidence_from_the_grip_to_the_lift_and_no_longer(
         told.get(state, []).append(procedure.held)
     for state, frames in told.items():
         assert all(bool(held) == (state in GRIPPING) for held in frames[1:-1])
-    first, last = told[PULL][0][0], told["sweep 1"][-1][0]
+    first, last = told[Stage.PULL][0][0], told["sweep 1"][-1][0]
     assert first.point_ct == last.point_ct  # of the moment of gripping, wherever it is by now
     assert first.point_ct == pytest.approx(
         transform_points(CAMERA_FROM_TABLE, tip_mm(HOLDER, [0.0])[None])[0]  # Deviating carries so
@@ -144,19 +125,11 @@ def test_what_the_cup_holds_is_evidence_from_the_grip_to_the_lift_and_no_longer(
     assert last.point_std_mm == pytest.approx(0.9 / np.sqrt(3))
 
 
-def test_a_grip_whose_arms_were_stopped_still_holds():
-    procedure = Procedure()
-    procedure.until("sweep 1")
-    procedure.operation.abort(Halt("stopped", {"words": "for a test"}))
-    assert procedure.frame().state.startswith(ABORTED)
-    assert len(procedure.held) == 1
-
-
 def test_without_a_motion_or_a_good_estimate_nothing_is_known_of_what_is_held():
     without = replace(small_update(frames=FRAMES), estimate=small_estimate())
     for update in (without, seen("poor"), replace(without, estimate=None, quality="none")):
         execution, grip = Execution(motions()), Grip(tip_mm, 1.2)
-        while execution.state != TAUT:
+        while execution.state != Stage.TAUT:
             grip.update(execution, update)
             execution.step(0.05)
         grip.update(execution, seen())  # too late: the tissue has moved since
@@ -167,7 +140,7 @@ def test_without_a_motion_or_a_good_estimate_nothing_is_known_of_what_is_held():
 def test_a_tip_that_moves_is_less_sure_of_where_it_is():
     execution, grip = Execution(motions()), Grip(tip_mm, 1.2)
     grip.update(execution, seen())
-    while execution.state != PULL:
+    while execution.state != Stage.PULL:
         execution.step(0.05)
     grip.update(execution, seen())
     before_mm = execution.joints_rad[6]
@@ -195,11 +168,11 @@ def test_the_pull_itself_halts_nothing_and_then_it_is_planned_on_the_pulled_tumo
         return work
 
     procedure = Procedure(replan)
-    procedure.until(PULL)
+    procedure.until(Stage.PULL)
     for _ in range(20):
         procedure.shift_mm = np.array([0.0, 0.0, procedure.operation._grip.pulled_mm])
         assert procedure.frame().halt is None
-    while procedure.frame().state == PULL:
+    while procedure.frame().state == Stage.PULL:
         pass
     procedure.shift_mm = np.array([0.0, 0.0, far_mm])
     assert procedure.frame().halt.kind == kind
@@ -221,11 +194,6 @@ def test_a_grip_that_slips_halts_the_arms():
     assert procedure.frame(seen(evidence=[{**slipped[0], "left_out": False}])).halt is None
 
 
-def test_bounds_count_as_three_deviations():
-    budget = ErrorBudget(margin_mm=9.0, hand_eye_mm=2.0, tool_mm=3.0, tracking_mm=5.0)
-    assert held_std_mm(budget) == 1.0  # what the calibration errs is in both ends of the way
-
-
 @pytest.fixture(scope="module")
 def taut():
     """A workcell that pulls, and what was planned in it."""
@@ -237,11 +205,11 @@ def test_arms_are_planned_to_pull_and_a_plan_without_its_pull_is_refused(taut, t
     config, plan, made = taut
     sweeps = [f"sweep {n}" for n in range(1, plan.sweeps + 1)]
     named = {stage.name: stage for stage in made.stages}
-    assert list(named) == ["approach", "grasp", HOLD, PULL, TAUT, *sweeps, LIFT, "release", "home"]
+    assert list(named) == [*FIRST, *sweeps, *LAST]
     cell = ArmCell(config, LOCATED.organ)
-    begin, end = (cell.tips(named[PULL].joints_rad[n])[HOLDER][:3, 3] for n in (0, -1))
+    begin, end = (cell.tips(named[Stage.PULL].joints_rad[n])[HOLDER][:3, 3] for n in (0, -1))
     assert end - begin == pytest.approx(PULL_MM * plan.lift, abs=0.02)
-    assert np.ptp(named[TAUT].joints_rad, axis=0).max() == 0
+    assert np.ptp(named[Stage.TAUT].joints_rad, axis=0).max() == 0
     content = PlanFolder(
         plan, ResectionConfig(), PublishedFrame("table"), LOCATED.meshes,
         (ErrorBudget(part="tumor_1", margin_mm=5.0),), config, made,
@@ -259,7 +227,7 @@ def test_what_is_taut_is_cut_along_the_same_facets_where_it_lies_now(taut, monke
     monkeypatch.setattr(
         arms_procedure, "_setting", [(ResectionConfig(most_facets=3), config, urdf)]
     )
-    here = next(stage.joints_rad[-1] for stage in made.stages if stage.name == TAUT)
+    here = next(stage.joints_rad[-1] for stage in made.stages if stage.name == Stage.TAUT)
     up_mm = PULL_MM * plan.lift
     meshes = {n: mesh.moved(mesh.vertices_mm + up_mm) for n, mesh in LOCATED.meshes.items()}
     pulled = replace(LOCATED, points_mm=LOCATED.points_mm + up_mm, meshes=meshes)
@@ -272,101 +240,38 @@ def test_what_is_taut_is_cut_along_the_same_facets_where_it_lies_now(taut, monke
     assert np.ptp(holder_rad, axis=0).max() == 0  # it pulls on, and does not pull again
 
 
-@pytest.fixture(scope="module")
-def pulled(clinic_model, phantom_case):
-    """A tumor's top, drawn up by 8 mm with the tissue around it, as the camera sees it; what a cup
-    there says; and the estimate before."""
-    case, tracker = load_case(phantom_case), Tracker(load_model(clinic_model))
-    camera_from_ct = looking_down(case)
-    tumor = case.anatomy.tumors[1].vertices_mm
-    up_ct = -camera_from_ct[2, :3]
-    top = case.anatomy.organ.vertices_mm
-    off = top - tumor.mean(0)
-    over = np.linalg.norm(off - np.outer(off @ up_ct, up_ct), axis=1) < 5
-    grip_ct = top[over][(top[over] @ up_ct).argmax()]
-
-    def carry(points_ct, pull_mm):
-        share = np.exp(-0.5 * (np.linalg.norm(points_ct - grip_ct, axis=1) / 18.0) ** 2)
-        return transform_points(camera_from_ct, points_ct + pull_mm * share[:, None] * up_ct)
-
-    def cloud(pull_mm):
-        mesh = trimesh.Trimesh(carry(top, pull_mm), case.anatomy.organ.faces, process=False)
-        tangents = np.stack(np.meshgrid(*[np.arange(-0.8, 0.8, 0.008)] * 2), -1).reshape(-1, 2)
-        rays = np.column_stack([tangents, np.ones(len(tangents))])
-        hits = mesh.ray.intersects_location(np.zeros_like(rays), rays, multiple_hits=False)[0]
-        # Arm and cup hide what they hold, and much beside it.
-        arm = np.linalg.norm(hits[:, :2] - carry(grip_ct[None], pull_mm)[0, :2], axis=1) < 35
-        return SensorCloud(hits[~arm].astype(np.float32))
-
-    before = tracker.locate(cloud(0.0))
-    tip_mm = carry(grip_ct[None], 0.0)[0]
-    point_ct = before.motion.back(tip_mm[None])
-    held = Held(
-        point_ct=tuple(point_ct[0]), point_std_mm=float(before.motion.std_mm(point_ct)[0]),
-        place_mm=tuple(carry(grip_ct[None], 8.0)[0]), std_mm=1.2,
+@pytest.mark.parametrize("reached", [True, False])
+def test_arms_that_stand_advise_what_they_reach(monkeypatch, reached):
+    touch = NextEvidence(
+        kind="touch", part="tumor_1", place_mm=(1.0, 2.0, 3.0), direction=(0.0, 0.0, -1.0),
+        std_mm=2.0, then_std_mm=1.0, bound_mm=6.0, then_bound_mm=3.0,
     )  # fmt: skip
-    return tracker, cloud(8.0), held, tumor, carry(tumor, 8.0)
+    ways = np.array(touch.place_mm), np.array(touch.direction)
+    monkeypatch.setattr(
+        "tumortrack_resection.operation.advise", lambda _, part, reach: [touch] * reach(*ways)
+    )
+    asked = []
 
+    def reach_of(organ, joints_rad):
+        return lambda place_mm, normal: asked.append((place_mm, normal)) or reached
 
-def test_with_what_is_held_a_pulled_tumor_is_found_nearer_to_where_it_is(pulled):
-    tracker, cloud, held, tumor_ct, true_mm = pulled
-
-    def off_mm(evidence):
-        estimate = tracker.locate(cloud, evidence=evidence)
-        return float(np.linalg.norm(estimate.motion.carry(tumor_ct) - true_mm, axis=1).mean())
-
-    assert off_mm([held]) < 0.8 * off_mm([])
-
-
-def test_a_held_point_that_slipped_is_left_out_and_halts_the_arms(pulled):
-    tracker, cloud, held, *_ = pulled
-    away = tuple(np.array(held.place_mm) + [0.0, 0.0, -25.0])
-    estimate = tracker.locate(cloud, evidence=[msgspec.structs.replace(held, place_mm=away)])
-    procedure = Procedure()
-    procedure.until("sweep 1")
-    update = replace(seen(), estimate=estimate, quality=estimate.quality)
-    assert procedure.frame(update).halt.kind == "slipped"
-
-
-def test_arms_that_stand_advise_touches_that_they_reach(pulled, monkeypatch):
-    tracker, cloud, *_ = pulled
-    estimate, config = tracker.locate(cloud), CellConfig()
-    table_from_camera = FRAMES.published_from_camera
-    meshes = {
-        name: mesh.moved(transform_points(table_from_camera, mesh.vertices_mm))
-        for name, mesh in estimate.meshes.items()
-    }
-    home_rad = ArmCell(config).home_rad
-    still = np.arange(2.0), np.tile(home_rad, (2, 1)), np.zeros(2, bool)
-    standing = Motions(tuple(MotionStage(name, *still) for name in ("approach", "hold", LIFT)))
-
-    def operation(config):
-        live = Following(
-            lambda update: replace(LOCATED, meshes=meshes), reach=partial(ArmsReach, config)
-        )
-        return Operation(
-            Planned(PLAN, meshes, standing), OperationConfig(), lambda joints_rad: (), live
-        )
-
-    monkeypatch.setattr(bound, "alternatives_mm", lambda report, name: 0.0)  # of an ellipsoid
-    monkeypatch.setattr(advice_module, "_LEAST_GAIN_MM", 0.0)  # the organ is seen well
-    update = replace(seen(), estimate=estimate)
-    acting = operation(config)
-    assert acting.act(update, 0.0).estimate.assessment.next_evidence == ()  # at work
-    advice = acting.act(replace(update, quality="poor"), 0.02).estimate.assessment.next_evidence
-    touches = [each for each in advice if each.kind == "touch"]
-    assert len(touches) == 3
-    reaches = ArmsReach(config, meshes["kidney"], home_rad)
-    for touch in touches:
-        place_mm = transform_points(table_from_camera, np.array([touch.place_mm]))[0]
-        assert reaches(place_mm, table_from_camera[:3, :3] @ touch.direction)
-    nowhere = operation(CellConfig(cutter_base=FAR, holder_base=FAR))
-    advice = nowhere.act(replace(update, quality="poor"), 0.0).estimate.assessment.next_evidence
-    assert {each.kind for each in advice} == {"outline"}
+    live = Following(lambda update: LOCATED, reach=reach_of)
+    arms = Operation(
+        Planned(PLAN, LOCATED.meshes, motions()), OperationConfig(), lambda joints_rad: (), live
+    )
+    estimate = seen().estimate
+    update = replace(seen(), estimate=estimate.assessed(next_evidence=(touch,)))
+    assert arms.act(update, 0.0).estimate.assessment.next_evidence == ()  # at work
+    assert not asked
+    halted = arms.act(replace(update, quality="poor"), 0.02).estimate.assessment.next_evidence
+    assert halted == (touch,) * reached
+    ((place_mm, normal),) = asked  # table frame
+    assert transform_points(CAMERA_FROM_TABLE, place_mm[None])[0] == pytest.approx(ways[0])
+    assert normal == pytest.approx([0.0, 0.0, 1.0])
 
 
 @pytest.mark.slow
-def test_a_live_pull_is_followed_planned_on_cut_and_filmed(ready_case, tmp_path):
+def test_a_live_pull_is_followed_planned_on_and_cut(ready_case, tmp_path):
     """The tumor goes up with the holder; everything else stays: the plan must follow."""
     case = load_case(ready_case)
     world = "breathing=false&instrument=false&camera_motion=false&fps=10"
@@ -398,13 +303,11 @@ def test_a_live_pull_is_followed_planned_on_cut_and_filmed(ready_case, tmp_path)
     output = succeeded(
         tumortrack(
             "resect", tmp_path / "plan", "--live", ready_case, live, "--speed", 3,
-            "--report", tmp_path / "report.json", "--replan-cut", "--film", tmp_path / "film.gif",
+            "--report", tmp_path / "report.json", "--replan-cut",
         )
     )  # fmt: skip
     assert "done: both virtual arms are home." in output
     resected = json.loads((tmp_path / "report.json").read_text())["resection"]
-    assert {PULL, TAUT} <= {entry["state"] for entry in resected["log"]}
+    assert {Stage.PULL, Stage.TAUT} <= {entry["state"] for entry in resected["log"]}
     assert any(entry.get("event") == "planned anew" for entry in resected["log"])
     assert not any("slipped" in halt for halt in resected["halts"])
-    with Image.open(tmp_path / "film.gif") as film:
-        assert film.n_frames > 30

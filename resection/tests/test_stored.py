@@ -17,6 +17,7 @@ from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError, NoPlan
 from tumortrack.core.mesh_files import write_mesh
 from tumortrack.live.values import PublishedFrame
+from tumortrack_devices.ros.messages import Messages
 from tumortrack_resection import begin_resection
 from tumortrack_resection.arms import procedure
 from tumortrack_resection.arms.body import cell_urdf
@@ -26,11 +27,16 @@ from tumortrack_resection.arms.kinematics import level_pose
 from tumortrack_resection.arms.procedure import plan_motions
 from tumortrack_resection.arms.trajectory import first_hit
 from tumortrack_resection.budget import ErrorBudget
-from tumortrack_resection.check import TOLERANCE_MM, clearances
-from tumortrack_resection.checking import checked
+from tumortrack_resection.check import TOLERANCE_MM, checked, clearances
 from tumortrack_resection.facets import sphere as directions
-from tumortrack_resection.files import PlanFolder, check_structures, read_plan, write_plan
-from tumortrack_resection.motions import CUTTER, JOINTS, WITHDRAW, Motions, MotionStage
+from tumortrack_resection.files import (
+    PlanFolder,
+    check_structures,
+    read_plan,
+    ros_trajectories,
+    write_plan,
+)
+from tumortrack_resection.motions import CUTTER, JOINTS, Motions, MotionStage, Stage
 from tumortrack_resection.operation import ResectionProgress
 from tumortrack_resection.values import ELECTRODE, ResectionConfig
 
@@ -115,20 +121,38 @@ def test_a_plan_keeps_its_motions_and_all_that_arms_are_judged_by(content, store
     assert begin_resection(stored).seconds == pytest.approx(content.motions.seconds)
 
 
-LACKING = ("frame_source", "cell_source", "budgets", "patient", "cell", "structures", "plan")
+def pop(*names):
+    def change(data):
+        *way, last = names
+        for name in way:
+            data = data[name]
+        data.pop(last)
+
+    return {"plan_json": change}
 
 
-@pytest.mark.parametrize("lacking", LACKING)
-def test_a_plan_that_lacks_what_arms_are_judged_by_is_refused(stored, tmp_path, lacking):
-    folder = changed(stored, tmp_path / "plan", plan_json=lambda data: data.pop(lacking))
-    with pytest.raises(ArtifactError, match=lacking):
+def unlink(file):
+    return {"files": lambda folder: (folder / f"{file}.ply").unlink()}
+
+
+NEEDED = ("frame_source", "cell_source", "budgets", "patient", "cell", "structures", "plan")
+OF_PLAN = ("facets", "taken", "keep_mm", "lift", "clearances", "cuts")
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        *((pop(name), name) for name in NEEDED),
+        *((pop("plan", name), name) for name in OF_PLAN),
+        *((unlink(name), name) for name in ("piece", "artery")),
+        ({"plan_json": lambda data: data.update(budgets=[])}, "budget"),
+        ({"plan_json": lambda data: data.update(cell=None)}, "cell"),
+    ],
+)
+def test_a_plan_that_lacks_what_arms_are_judged_by_is_refused(stored, tmp_path, change, named):
+    folder = changed(stored, tmp_path / "plan", **change)
+    with pytest.raises(ArtifactError, match=named):
         read_plan(folder)
-
-
-def test_a_plan_of_which_no_tumor_has_a_budget_is_refused(stored, tmp_path):
-    folder = changed(stored, tmp_path / "plan", plan_json=lambda data: data.update(budgets=[]))
-    with pytest.raises(ArtifactError):
-        begin_resection(folder)
 
 
 def test_a_structure_with_the_name_of_a_plans_file_is_refused():
@@ -136,28 +160,6 @@ def test_a_structure_with_the_name_of_a_plans_file_is_refused():
     for name in ("piece", "strokes"):
         with pytest.raises(InputError, match=name):
             check_structures(["artery", name])
-
-
-@pytest.mark.parametrize("lacking", ["facets", "taken", "keep_mm", "lift", "clearances", "cuts"])
-def test_a_plan_without_what_its_motions_are_checked_by_is_refused(stored, tmp_path, lacking):
-    folder = changed(stored, tmp_path / "plan", plan_json=lambda data: data["plan"].pop(lacking))
-    with pytest.raises(ArtifactError, match=lacking):
-        read_plan(folder)
-
-
-@pytest.mark.parametrize("file", ["piece", "artery"])
-def test_a_plan_without_one_of_its_surfaces_is_refused(stored, tmp_path, file):
-    folder = changed(
-        stored, tmp_path / "plan", files=lambda folder: (folder / f"{file}.ply").unlink()
-    )
-    with pytest.raises(ArtifactError, match=file):
-        read_plan(folder)
-
-
-def test_motions_without_the_cell_that_they_are_for_are_refused(stored, tmp_path):
-    folder = changed(stored, tmp_path / "plan", plan_json=lambda data: data.update(cell=None))
-    with pytest.raises(ArtifactError, match="no cell that they are for"):
-        read_plan(folder)
 
 
 def longer_electrode(folder):
@@ -220,7 +222,7 @@ def turn(arrays):
         (shift, r"jumps by 0\.001 rad at sweep 1"),
         (rename(*FIRST, "sweep 2", "sweep 1", *LAST), "stages"),
         (rename(*FIRST, "sweep x", "sweep 2", *LAST), "stages"),
-        (rename(WITHDRAW, *FIRST[1:], "sweep 1", "sweep 2", "sweep 3", *LAST), "stages"),
+        (rename(Stage.WITHDRAW, *FIRST[1:], "sweep 1", "sweep 2", "sweep 3", *LAST), "stages"),
         (rename("approach"), "stages are approach"),
     ],
 )
@@ -368,25 +370,6 @@ def test_the_electrode_goes_through_the_organ_only_as_slowly_as_it_cuts(content)
     assert "cutter/electrode would meet organ" in first_hit(hasty, CONFIG, LOCATED.organ)
 
 
-def test_stages_come_in_their_order_and_the_instrument_is_home_before_the_piece_is_lifted(content):
-    stages = content.motions.stages
-    sweeps = [f"sweep {n}" for n in range(1, content.plan.sweeps + 1)]
-    assert [stage.name for stage in stages] == [*FIRST, *sweeps, *LAST]
-    for stage in stages:
-        cutter, holder = np.split(stage.joints_rad, 2, axis=1)
-        if stage.name in FIRST:
-            assert np.ptp(cutter, axis=0).max() == 0
-        if stage.name in sweeps:
-            assert np.ptp(holder, axis=0).max() == 0
-        assert stage.cutting.any() == (stage.name in sweeps)
-    lift = stages[number_of(content.motions, "lift")]
-    cutter, holder = np.split(lift.joints_rad, 2, axis=1)
-    rising = np.flatnonzero(np.abs(holder - holder[0]).max(1) > 1e-9)
-    assert len(rising)
-    assert cutter[rising] == pytest.approx(np.tile(CONFIG.home_rad[:6], (len(rising), 1)))
-    assert np.ptp(cutter[: rising[0]], axis=0).max() > 0.1  # it went home first
-
-
 # Beside the live loop -----------------------------------------------------------------------------
 
 
@@ -427,7 +410,11 @@ def test_an_organ_that_moved_is_cut_on_along_the_same_facets(content, worker, sw
     organ, joints_rad = lying(shift_mm), in_the_middle_of(content.motions, sweep)
     made = worker(organ, joints_rad, ResectionProgress(True, sweep - 1), before)
     names = [stage.name for stage in made.motions.stages]
-    assert names == [WITHDRAW, *(f"sweep {n}" for n in range(sweep, before.sweeps + 1)), *LAST]
+    assert names == [
+        Stage.WITHDRAW,
+        *(f"sweep {n}" for n in range(sweep, before.sweeps + 1)),
+        *LAST,
+    ]
     assert made.motions.stages[0].joints_rad[0] == pytest.approx(joints_rad)
     assert made.plan.facets[:, :3] == pytest.approx(before.facets[:, :3])
     offsets = before.facets[:, 3] + before.facets[:, :3] @ shift_mm
@@ -442,12 +429,6 @@ def test_an_organ_that_moved_is_cut_on_along_the_same_facets(content, worker, sw
         checked(before, made.motions, URDF, lying(shift_mm + 6 * before.facets[-1, :3]))
 
 
-def test_before_the_grasp_it_is_planned_from_the_approach_on(content, worker):
-    made = worker(lying([3.0, 0, 0]), np.array(CONFIG.home_rad), ResectionProgress(), content.plan)
-    assert [stage.name for stage in made.motions.stages][:4] == [*FIRST, "sweep 1"]
-    assert made.plan.facets[:, :3] == pytest.approx(content.plan.facets[:, :3])
-
-
 @pytest.mark.parametrize("sweep", [1, 2])
 def test_an_organ_that_moves_by_two_millimetres_leaves_every_facet_possible(content, worker, sweep):
     """Or the arms would stand with the electrode in tissue."""
@@ -456,7 +437,7 @@ def test_an_organ_that_moves_by_two_millimetres_leaves_every_facet_possible(cont
         progress = ResectionProgress(True, sweep - 1)
         made = worker(lying(shift_mm), joints_rad, progress, content.plan)
         assert made.plan.facets[:, :3] == pytest.approx(content.plan.facets[:, :3])
-        assert made.motions.stages[0].name == WITHDRAW
+        assert made.motions.stages[0].name == Stage.WITHDRAW
 
 
 @pytest.mark.parametrize("others", [0, 1])
@@ -509,7 +490,7 @@ def test_an_instrument_leaves_a_tumor_that_came_to_it_without_coming_nearer(
     organ = lying(by_mm * towards, parts=("tumor_1",))
     made = worker(organ, joints_rad, ResectionProgress(True, 1), content.plan)
     withdraw = made.motions.stages[0]
-    assert withdraw.name == WITHDRAW
+    assert withdraw.name == Stage.WITHDRAW
     assert not withdraw.cutting.any()
     at_first, at_worst = distances(standing, organ), distances(Motions((withdraw,)), organ)
     assert at_first[ELECTRODE] == pytest.approx(left_mm, abs=0.2)
@@ -519,3 +500,32 @@ def test_an_instrument_leaves_a_tumor_that_came_to_it_without_coming_nearer(
     assert np.cross(gone_mm, tip[:3, 0]) == pytest.approx(np.zeros(3), abs=0.1)  # straight back
     assert gone_mm @ tip[:3, 0] < -10
     assert made.plan.least_mm["tumor_1"] >= MARGIN_MM - TOLERANCE_MM
+
+
+# For MoveIt ---------------------------------------------------------------------------------------
+
+
+def test_a_plan_s_motions_are_trajectories_of_all_joints():
+    messages, times = Messages(), np.array([0.0, 0.5, 1.25])
+    joints = np.zeros((3, 12))
+    joints[1:, 0], joints[:, 7] = [0.25, 1.0], 0.5
+    still = MotionStage("hold", np.zeros(1), joints[:1], np.zeros(1, bool))
+    moving = MotionStage("approach", times, joints, np.zeros(3, bool))
+    written = json.loads(ros_trajectories(Motions((still, moving)), "table"))
+    (stage,) = written["stages"]
+    said = stage["trajectory"]["joint_trajectory"]
+    points = [{**one, "positions": np.array(one["positions"]),
+               "velocities": np.array(one["velocities"])} for one in said["points"]]  # fmt: skip
+    message = messages.make(
+        "moveit_msgs/msg/RobotTrajectory", joint_trajectory={**said, "points": points}
+    )
+    again = messages.from_bytes(messages.to_bytes(message), "moveit_msgs/msg/RobotTrajectory")
+    trajectory = again.joint_trajectory
+    assert (stage["name"], stage["seconds"]) == ("approach", 1.25)
+    assert trajectory.joint_names == list(JOINTS)
+    assert trajectory.header.frame_id == "table"
+    np.testing.assert_allclose([one.positions for one in trajectory.points], joints, atol=1e-6)
+    starts = [one.time_from_start.sec + 1e-9 * one.time_from_start.nanosec
+              for one in trajectory.points]  # fmt: skip
+    np.testing.assert_allclose(starts, times)
+    assert [one.velocities[0] for one in trajectory.points] == [0, pytest.approx(0.7), 0]

@@ -17,7 +17,6 @@ from live_objects import small_setting, small_update
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.packages import to_install
 from tumortrack.live.spec import SINKS
-from tumortrack.live.workers import SinkWorker
 from tumortrack_resection.ur_sink import SILENT_S, UR_JOINTS, UrSink, UrSinkConfig
 from workcell_objects import with_arms, workcell, working
 
@@ -144,14 +143,6 @@ def test_by_default_nothing_is_connected_and_targets_are_counted(arm, monkeypatc
     sink.close()
     assert sink.counts == {"would send": 5, "halted": 1, "no arms": 1}
     assert arm.opened == arm.calls == []
-
-
-def test_an_outlet_reports_the_counts():
-    outlet = SinkWorker("ur", UrSinkConfig(host="10.0.0.9").open(with_arms()), 5)
-    for n in range(3):
-        outlet.put(working(n, n * 0.01))
-    outlet.close()
-    assert outlet.summary()["counts"] == {"would send": 3}
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,5 @@
-"""From a tumor that tumortrack located to a resection that two arms carry out.
-
-    from tumortrack_resection import plan_resection
-    plan = plan_resection("RUN")  # a folder that `tumortrack locate` wrote
-
-Millimetres; the table's frame has z up. Commands: `tumortrack plan`, `tumortrack resect`.
-"""
+"""From a tumor that tumortrack located to a resection that two arms carry out: the commands
+`plan` and `resect`. Millimetres; the table's frame has z up."""
 
 from __future__ import annotations
 
@@ -12,11 +7,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tumortrack_resection.api import plan_resection as plan_resection
     from tumortrack_resection.planning import begin_plan as begin_plan
+    from tumortrack_resection.planning import plan_resection as plan_resection
     from tumortrack_resection.session import begin_resection as begin_resection
 
-_MODULES = {"begin_plan": "planning", "begin_resection": "session", "plan_resection": "api"}
+_MODULES = {"begin_plan": "planning", "begin_resection": "session", "plan_resection": "planning"}
 __all__ = ["begin_plan", "begin_resection", "plan_resection"]
 
 

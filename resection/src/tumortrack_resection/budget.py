@@ -7,18 +7,23 @@ hand-eye calibration and tool are bounds of independent errors: they add in quad
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import msgspec
 import numpy as np
+from jaxtyping import Float64
 
 from tumortrack.core.assessment import ErrorBound
-from tumortrack.core.config import Config
+from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.halt import Halt
 from tumortrack.core.mesh_query import contains, nearest_places
-from tumortrack.core.organ import is_tumor, organ_name
+from tumortrack.core.organ import organ_name
+from tumortrack.core.types import Mesh
+from tumortrack.live.values import TrackingResult
 from tumortrack_resection.facets import TOOLS, Tools
 from tumortrack_resection.ur_sink import OFF_MM
 from tumortrack_resection.values import (
@@ -43,18 +48,19 @@ MOVED_MM = 2.0  # allowed for in a plan: the arms halt once the tumor has moved 
 TERMS = ("tracking", "hand-eye", "tool", "motion", "lag")
 _SPACING_MM = 0.5  # between points on the planned cuts
 
+_SPEED_S = 0.3  # time over which a speed is averaged: estimates jitter from frame to frame
+_GAP_S = 0.5  # an older position does not count for the speed
+
 
 class ErrorBudget(Config, frozen=True, kw_only=True):
     """Bounds of errors, mm, and the distance that they are taken from, for one tumor.
 
     Attributes:
-        part: the tumor's name.
-        margin_mm: the least distance between the electrode, cutting or not, and the tumor's located
-            surface; negative where it goes into the tumor.
-        tracking_mm: of the tumor's located surface: the estimate's bound (95 %).
+        margin_mm: the electrode's least distance to the tumor's located surface, cutting or not;
+            negative where it goes into the tumor.
+        tracking_mm: of that surface: the estimate's bound (95 %).
         hand_eye_mm: of the camera's place in the arms' frame, at the tumor.
-        tool_mm: of the tool's tip: the arm's accuracy, compliance, and its tolerated distance from
-            its target.
+        tool_mm: of the tool's tip: the arm's accuracy, and its tolerated distance from its target.
         motion_mm: of the tumor since the plan; when planned, what is allowed for.
         lag_mm: how far the tumor moves before the arms act on an estimate.
         assumed: terms that were neither measured nor stated.
@@ -78,7 +84,6 @@ class ErrorBudget(Config, frozen=True, kw_only=True):
 
     @property
     def terms(self) -> dict[str, float]:
-        """Each term by its name, mm."""
         return {name: getattr(self, f"{name.replace('-', '_')}_mm") for name in TERMS}
 
     @property
@@ -104,7 +109,6 @@ class ErrorBudget(Config, frozen=True, kw_only=True):
         return self.as_halt.words
 
     def table(self) -> list[str]:
-        """Lines for the screen."""
         lines = [f"errors that the electrode's distance to {self.part} has to cover, mm:"]
         for name, value in self.terms.items():
             how = ErrorBound(value).words if name == "tracking" else ""
@@ -132,8 +136,8 @@ def planned_budgets(
     moved_mm: float = MOVED_MM,
     tools: Tools = TOOLS,
 ) -> tuple[ErrorBudget, ...]:
-    """Of each tumor, the planned one's first. ``hand_eye_mm`` and ``tool_error_mm`` are assumed if
-    not stated. Apart from ``moved_mm`` the organ lies still: there is no lag yet."""
+    """Of each tumor, the planned one's first. What is not stated is assumed. Apart from
+    ``moved_mm`` the organ lies still: there is no lag yet."""
     stated = {"hand-eye": hand_eye_mm, "tool": tool_error_mm}
     least_mm = plan.least_mm or foreseen_mm(plan, located, tools)
     others = [name for name in map(name_of, located.tumors) if name != plan.tumor]
@@ -152,7 +156,6 @@ def planned_budgets(
 
 
 def tightest(budgets: Sequence[ErrorBudget]) -> ErrorBudget:
-    """Of the tumor that is the least safe."""
     return min(budgets, key=lambda budget: budget.left_mm)
 
 
@@ -180,31 +183,38 @@ def checked_against(
 
 
 def foreseen_mm(plan: ResectionPlan, located: Located, tools: Tools) -> dict[str, float]:
-    """The least distance of the electrode on its cuts to each tumor and structure, mm; negative: so
-    deep inside. Of cuts without a direction, of the tip. What the arms do besides is known only
+    """The least distance of the electrode (without a direction: of the tip) on its cuts to each
+    tumor and structure, mm; negative: so deep inside. What the arms do besides is known only
     once their motions are checked."""
-    surfaces = {**located.meshes, **located.structures}
-    organ = organ_name(located.meshes)
     lines = []
     for cut in plan.cuts:
         far = np.arange(0.0, tools.electrode_mm, 2 * _SPACING_MM) if cut.axis is not None else [0.0]
         axis = np.zeros(3) if cut.axis is None else cut.axis
         lines.append((cut.path_mm[:, None] - np.outer(far, axis)).reshape(-1, 3))
     points = np.concatenate(lines)
-    least = {}
-    for name, mesh in surfaces.items():
-        if name == organ:
-            continue
-        away = np.linalg.norm(nearest_places(mesh, points) - points, axis=1)
-        inside = contains(mesh, points) if is_tumor(name) else np.zeros(len(points), bool)
-        deep, near = float(away[inside].max(initial=0)), float(away.min()) - tools.radius_mm
-        least[name] = -deep if inside.any() else near
-    return least
+    organ = organ_name(located.meshes)
+    return {
+        name: nearest(mesh, points, tools.radius_mm)[0]
+        for name, mesh in located.surfaces.items()
+        if name != organ
+    }
+
+
+def nearest(
+    mesh: Mesh, points: Float64[np.ndarray, "n 3"], radius_mm: float
+) -> tuple[float, int, Float64[np.ndarray, " 3"]]:
+    """Of points on an electrode's axis: its distance to a surface, negative where a point is so
+    deep in a tumor; which point that is, and the nearest place of the surface."""
+    places = nearest_places(mesh, points)
+    away = np.linalg.norm(places - points, axis=1)
+    inside = contains(mesh, points) if mesh.closed else np.zeros(len(points), bool)
+    at = int(np.where(inside, away, -1.0).argmax() if inside.any() else away.argmin())
+    mm = -away[at] if inside.any() else away[at] - radius_mm
+    return float(mm), at, places[at]
 
 
 def kept_words(plan: ResectionPlan, least_mm: Mapping[str, float]) -> str:
-    """The electrode's least distances: to the tumor, what was asked for, and to all others. Of an
-    unchecked plan they are those of its cuts alone."""
+    """The electrode's least distances; of an unchecked plan those of its cuts alone."""
     kept, how = least_mm[plan.tumor], "the electrode"
     if not plan.clearances:
         how = "on its cuts, unchecked, the electrode"
@@ -228,7 +238,6 @@ def lost_words(plan: ResectionPlan) -> str:
 
 
 def _remedy(plan: ResectionPlan, budget: ErrorBudget) -> str:
-    """A margin that suffices, if there is one."""
     enough_mm = math.ceil(2 * (plan.margin_mm - budget.left_mm) + 0.2) / 2
     if plan.method != "margin":
         return "The method knows the instrument's tip alone; take the method margin."
@@ -237,3 +246,85 @@ def _remedy(plan: ResectionPlan, budget: ErrorBudget) -> str:
     if enough_mm > MARGIN_MM[1]:
         return "Look from nearer, or uncover more of the organ."
     return f"{enough_mm:g} mm would cover them (--margin, margin_mm)."
+
+
+class LiveBudget:
+    """Adds up the errors of every update. Where a person accepted a planned distance that does
+    not cover a tumor's errors, they never halt the arms, unless they become unknown.
+    ``servo_s``: how far the arms lag behind. ``now``: of the last estimate and the tumor that is
+    the least safe; ``worst``: the one with the least left while the arms were allowed to move."""
+
+    def __init__(self, planned: Sequence[ErrorBudget], servo_s: float = 0.0) -> None:
+        self._planned = {budget.part: budget for budget in planned}
+        self._servo_s = servo_s
+        self.now: ErrorBudget | None = None
+        self.worst: ErrorBudget | None = None
+        # Of the tumor's centroid, by stamp
+        self._places: deque[tuple[int, Float64[np.ndarray, " 3"]]] = deque()
+
+    def add_up(
+        self,
+        update: TrackingResult,
+        part: str,
+        tumors: Mapping[str, tuple[Mesh, float]],
+        least_mm: Mapping[str, float],
+    ) -> tuple[Halt | None, bool]:
+        """Why the arms must halt (None: they need not), and whether a new plan would help.
+        ``part``: the planned tumor; ``tumors``: all surfaces, table frame, each with its largest
+        distance from where it was planned, mm; ``least_mm``: the electrode's distances from
+        them, as planned."""
+        estimate = update.estimate
+        assert estimate is not None
+        late_ms = max(update.latency_ms or 0.0, 0.0)  # a camera's clock may be ahead
+        smoothing = estimate.report.smoothing
+        late_ms += 0.0 if smoothing is None else smoothing.lag_ms
+        speed_mm_s = self._speed_mm_s(update.stamp_ns, tumors[part][0])
+        lag_mm = speed_mm_s * (late_ms / 1000 + self._servo_s)
+        bounds = estimate.assessment.bounds
+        budgets = {
+            name: self._planned[name].updated(
+                bounds[name].error_bound95_mm if name in bounds else None,
+                margin_mm=least_mm[name], motion_mm=float(motion_mm), lag_mm=lag_mm,
+            )
+            for name, (_, motion_mm) in tumors.items()
+            if name in self._planned
+        }  # fmt: skip
+        self.now = tightest(list(budgets.values()))
+        for name, now in budgets.items():
+            if "tracking" in now.assumed and "tracking" not in self._planned[name].assumed:
+                return Halt("no_bound", {"part": name}), False
+        covered = {n: each for n, each in budgets.items() if self._planned[n].left_mm >= 0}
+        if not covered or (worst := tightest(list(covered.values()))).left_mm >= 0:
+            return None, False
+        return worst.as_halt, msgspec.structs.replace(worst, motion_mm=0.0).left_mm >= 0
+
+    def went_on(self) -> None:
+        """The arms may move on the last estimate."""
+        if self.now is not None and (self.worst is None or self.now.left_mm < self.worst.left_mm):
+            self.worst = self.now
+
+    def forget(self) -> None:
+        """There is no estimate."""
+        self.now = None
+
+    def summary(self) -> dict[str, Any]:
+        planned = tightest(list(self._planned.values()))
+        budgets = {"planned": planned, "worst": self.worst}
+        return {
+            name: {**to_builtins(budget), "sum_mm": budget.sum_mm, "left_mm": budget.left_mm}
+            for name, budget in budgets.items()
+            if budget is not None
+        }
+
+    def _speed_mm_s(self, stamp_ns: int, tumor: Mesh) -> float:
+        """Recent speed of the tumor's centroid; 0 for the first estimate."""
+        places = self._places
+        if places and not 0 < stamp_ns - places[-1][0] <= 1e9 * _GAP_S:
+            places.clear()
+        places.append((stamp_ns, tumor.vertices_mm.mean(0)))
+        while len(places) > 2 and places[-1][0] - places[1][0] >= 1e9 * _SPEED_S:
+            places.popleft()
+        (first_ns, first_mm), (last_ns, last_mm) = places[0], places[-1]
+        if last_ns == first_ns:
+            return 0.0
+        return float(np.linalg.norm(last_mm - first_mm)) / (1e-9 * (last_ns - first_ns))

@@ -16,18 +16,20 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import cache, cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.geometry import rotation_onto
 from tumortrack.core.mesh_query import contains
+from tumortrack.core.organ import is_tumor, organ_name
 from tumortrack.core.types import Mesh
-from tumortrack_resection.motions import LIFT, Motions
+from tumortrack_resection.motions import Motions, Stage
 from tumortrack_resection.urdf import GRASPER, Configurations, Ends, Frames, ToolSolid, UrdfCell
-from tumortrack_resection.values import ELECTRODE, Clearance
+from tumortrack_resection.values import CUTS_TUMOR, ELECTRODE, Clearance, Located, ResectionPlan
 
 STEP_MM, TOLERANCE_MM = 0.3, 0.3
 IN_TISSUE = (ELECTRODE, "shaft")  # what of the cutter is meant to be there
@@ -53,7 +55,7 @@ class _Poses:
             raise InputError("the motions have joint angles that are not finite.")
         self._first = np.cumsum([0, *(len(stage.times_s) for stage in stages)])
         names = [stage.name for stage in stages]
-        lift = int(self._first[names.index(LIFT) if LIFT in names else -1])
+        lift = int(self._first[names.index(Stage.LIFT) if Stage.LIFT in names else -1])
         ends_mm = cell.ends(solids, samples)
         piece = _piece(cell, samples, lift)
         ends_mm += [_seen(piece, ends) for ends in ends_mm]
@@ -219,16 +221,10 @@ def _least(
 def clearances(
     urdf: str, motions: Motions, parts: Mapping[str, Mesh], carried: Collection[str]
 ) -> tuple[Clearance, ...]:
-    """Of each solid of the tools from each part.
-
-    Args:
-        urdf: the text of ``cell.urdf``.
-        parts: surfaces of tumors and structures by their names; table frame, mm. One that is open
-            has no depth: crossed, it is at 0.
-        carried: those that move with the holder's tip from the beginning of ``LIFT``.
-
-    ArtifactError: no cell's URDF. InputError: nothing to be checked.
-    """
+    """Of each solid of the tools from each of ``parts``: surfaces of tumors and structures,
+    table frame, mm (one that is open has no depth: crossed, it is at 0). Those ``carried`` move
+    with the holder's tip from the beginning of ``Stage.LIFT``. ArtifactError: no cell's URDF.
+    InputError: nothing to be checked."""
     if unknown := set(carried) - set(parts):
         raise InputError(f"{', '.join(sorted(unknown))} would be carried and is no part.")
     cell, found = UrdfCell(urdf), []
@@ -253,19 +249,15 @@ def clearances(
 def faults(
     found: Sequence[Clearance], least_mm: Mapping[str, float], taken: Collection[str]
 ) -> list[str]:
-    """What forbids the motions, a sentence each; empty: nothing does.
-
-    Args:
-        least_mm: by part, what electrode and shaft must keep, less ``TOLERANCE_MM``. The other
-            solids may touch ``taken``, the tumors that come away, and no other part named here.
-    """
+    """What forbids the motions, a sentence each. ``least_mm``: by part, what electrode and shaft
+    must keep, less ``TOLERANCE_MM``; the other solids may touch ``taken``, the tumors that come
+    away, and no other part named here."""
     known = {one.part for one in found if one.solid == ELECTRODE}
     lacking = [f"How near the electrode comes to {n} is unknown." for n in {*least_mm} - known]
     return sorted(lacking) + [text for one in found if (text := _fault(one, least_mm, taken))]
 
 
 def _fault(one: Clearance, least_mm: Mapping[str, float], taken: Collection[str]) -> str:
-    """What is wrong with it, or an empty text."""
     if not np.isfinite([one.least_mm, one.energised_mm or 0.0]).all():
         return f"How near the {one.solid} comes to {one.part} cannot be computed."
     needs_mm = least_mm.get(one.part)
@@ -289,9 +281,36 @@ def _fault(one: Clearance, least_mm: Mapping[str, float], taken: Collection[str]
 def electrode_poses(
     urdf: str, motions: Motions, step_mm: float = STEP_MM
 ) -> tuple[Ends, Bool[np.ndarray, " n"]]:
-    """Tip and rear end of the bare electrode's axis (n, 2, 3; table frame, mm), at most ``step_mm``
-    from one pose to the next, and whether it cuts (n,). Errors as of ``clearances``."""
+    """Tip and rear end of the bare electrode's axis (table frame, mm), at most ``step_mm`` from
+    one pose to the next, and whether it cuts. Errors as of ``clearances``."""
     cell = UrdfCell(urdf)
     solids = [next(solid for solid in cell.solids if solid.name == ELECTRODE)]
     poses = _Poses(cell, solids, motions, step_mm)
     return poses.ends_mm[0], poses.cuts
+
+
+def checked(plan: ResectionPlan, motions: Motions, urdf: str, located: Located) -> ResectionPlan:
+    """The plan with its ``clearances``; ``located``: what it was planned on. Raises NoPlan: a
+    tool comes nearer to something than it may. The paper's method is not refused, but says what
+    it does to the tumor. An instrument that withdraws is not checked: it goes straight back."""
+    if motions.stages[0].name == Stage.WITHDRAW:
+        motions = Motions(motions.stages[1:])
+    organ = organ_name(located.meshes)
+    parts = {name: mesh for name, mesh in located.surfaces.items() if name != organ}
+    found = clearances(urdf, motions, parts, plan.taken)
+    published = plan.method == "published"
+    needed = {name: plan.margin_mm for name in plan.taken if not published} | plan.keep_mm
+    if wrong := faults(found, needed, plan.taken):
+        raise NoPlan(f"{wrong[0]} Ask for another margin, or place the organ otherwise.")
+    plan = replace(plan, clearances=found)
+    harm = [
+        f"{CUTS_TUMOR} {name}, up to {-mm:.1f} mm deep"
+        for name, mm in plan.least_mm.items()
+        if mm < 0 and is_tumor(name)
+    ]
+    touched = [
+        f"the {each.solid} touches {each.part}" for each in found
+        if each.least_mm <= 0 and each.solid not in IN_TISSUE and each.part in plan.taken
+    ]  # fmt: skip
+    notes = [*(f"{words}." for words in harm), *plan.notes, *(f"{words}." for words in touched)]
+    return replace(plan, notes=tuple(notes))

@@ -8,15 +8,25 @@ from typing import NamedTuple
 
 import manifold3d
 import numpy as np
-from jaxtyping import Float64
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.mesh_query import contains
+from tumortrack.core.organ import organ_name
 from tumortrack.core.types import ORGAN, Mesh
 from tumortrack.imaging.meshes import mesh_of, solid_of
-from tumortrack_resection.facets import UP, FacetSearch, Piece, Tools, Vector, inside, keep_mm
-from tumortrack_resection.published import published_cuts
+from tumortrack_resection.facets import (
+    TOOLS,
+    UP,
+    FacetSearch,
+    Piece,
+    Tools,
+    Vector,
+    inside,
+    keep_mm,
+    sphere,
+)
+from tumortrack_resection.outline import published_cuts
 from tumortrack_resection.strokes import (
     Facet,
     Sections,
@@ -25,7 +35,6 @@ from tumortrack_resection.strokes import (
     grasp_point,
     trimmed,
 )
-from tumortrack_resection.tumors import chosen_tumor
 from tumortrack_resection.values import (
     NO_ROOM,
     UNGUARDED,
@@ -48,11 +57,13 @@ _LOWEST = (-0.5, -0.5, -0.2, -0.2, -0.2, 0.0)
 _MOST_WAYS = 8  # to cut a facet
 _MOST_PIECES, _MOST_SEARCHES = 8, 6  # that are looked at, each without what was to blame before
 _EVERY, _SHELL_MM = 8, 1.5  # points of healthy tissue, and of the tumor's surface, for its shell
+_DIRECTIONS, _MOST = 192, 12_000  # of the hull, points it is made of: off by 0.5 mm
+_FEWEST = 30  # points that define a tumor's shape
 
 
 class _Unfit(NamedTuple):
-    """Why a piece can't be planned; ``normals``: numbers of those that are to blame; ``tool``: a
-    longer electrode would do."""
+    """Why a piece can't be planned; ``normals``: to blame; ``tool``: a longer electrode would
+    do."""
 
     words: str
     normals: tuple[int, ...] = ()
@@ -61,16 +72,11 @@ class _Unfit(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """A piece, and for each sweep the ways to cut it, the best first. Table frame, mm.
-
-    Attributes:
-        taken: labels of the tumors that come away.
-        share: of the tumor outside the organ's hull.
-        piece: its facets; None: the paper's method has none.
-        keep_mm: what the electrode keeps away from beside the tumors that come away.
-        solid: what comes away, closed. ``healthy``, ``kerf``: shares of the parenchyma that come
-            away with it, and that the electrode's width takes.
-    """
+    """A piece, and for each sweep the ways to cut it, the best first. ``taken``: labels of the
+    tumors that come away. ``share``: of the tumor outside the organ's hull. ``piece``: None: the
+    paper's method has none. ``keep_mm``: what the electrode keeps away from beside these.
+    ``solid``: what comes away, closed. ``healthy``, ``kerf``: shares of the parenchyma that come
+    away with it, and that the electrode's width takes."""
 
     located: Located
     config: ResectionConfig
@@ -88,46 +94,39 @@ class Draft:
     notes: tuple[str, ...] = ()
 
     @property
+    def lost(self) -> float:
+        return self.healthy + self.kerf
+
+    @property
     def level(self) -> bool:
         """A way needs several directions of a level instrument, which the arms choose."""
         return self.piece is None
 
     @property
-    def facets(self) -> Float64[np.ndarray, "k 4"]:
-        """As in ``ResectionPlan``."""
-        return np.zeros((0, 4)) if self.piece is None else self.piece.planes
-
-    @property
-    def lost(self) -> float:
-        """Share of the parenchyma."""
-        return self.healthy + self.kerf
-
-    @property
     def keep(self) -> dict[str, tuple[Mesh, float]]:
-        """Surfaces, with the distances that the electrode keeps from them whatever it does. The
-        paper's method knows none."""
+        """Surfaces, with the distances that the electrode keeps from them whatever it does."""
         kept = {} if self.level else {name_of(n): self.config.margin_mm for n in self.taken}
-        surfaces = {**self.located.meshes, **self.located.structures}
+        surfaces = self.located.surfaces
         return {name: (surfaces[name], mm) for name, mm in {**kept, **self.keep_mm}.items()}
 
     def plan(self, cuts: tuple[Cut, ...] = ()) -> ResectionPlan:
         """With these ways; by default each sweep's best, as far as geometry goes."""
         cuts = cuts or tuple(choices[0] for choices in self.sweeps)
         located, config = self.located, self.config
-        organ_ml = located.organ.volume_ml
         tumors_ml = {n: located.meshes[name_of(n)].volume_ml for n in located.tumors}
-        parenchyma_ml = organ_ml - sum(tumors_ml.values())
-        with_it_ml = sum(tumors_ml[n] for n in self.taken)
+        parenchyma_ml = located.parenchyma_ml
         healthy_ml = parenchyma_ml * self.healthy
         volumes_ml = {
-            "organ": organ_ml, "parenchyma": parenchyma_ml, "tumor": tumors_ml[self.label],
-            "piece": healthy_ml + with_it_ml, "healthy": healthy_ml,
+            "organ": located.organ.volume_ml, "parenchyma": parenchyma_ml,
+            "tumor": tumors_ml[self.label], "healthy": healthy_ml,
+            "piece": healthy_ml + sum(tumors_ml[n] for n in self.taken),
         }  # fmt: skip
         if not self.level:
             volumes_ml["kerf"] = parenchyma_ml * self.kerf
+        facets = np.zeros((0, 4)) if self.piece is None else self.piece.planes
         return ResectionPlan(
             method=config.method, tumor=name_of(self.label), label=self.label,
-            grasp_mm=self.grasp_mm, cuts=cuts, piece=self.solid, facets=self.facets,
+            grasp_mm=self.grasp_mm, cuts=cuts, piece=self.solid, facets=facets,
             taken=tuple(map(name_of, self.taken)), keep_mm=dict(self.keep_mm), lift=self.lift,
             margin_mm=config.margin_mm, volumes_ml=volumes_ml, exophytic=self.share,
             stamp_ns=located.stamp_ns, notes=self.notes,
@@ -137,7 +136,7 @@ class Draft:
 class Drafts:
     """The pieces that can be planned for one tumor, the best first; others once one or the other
     facet is left out. ``like``: an earlier plan, whose facets are kept, and with them what comes
-    away and what they keep away from. Raises as ``plan_resection``."""
+    away and what they keep away from."""
 
     def __init__(
         self, located: Located, config: ResectionConfig, tools: Tools,
@@ -156,7 +155,7 @@ class Drafts:
         self._over = False
 
     def best(self) -> Draft:
-        """Raises NoPlan: there is none any more."""
+        """Raises InputError: no such tumor; NoPlan: there is none any more."""
         if self._over:
             raise NoPlan("the facets of the earlier plan can be cut from no direction.")
         if self._best is None:
@@ -234,7 +233,6 @@ class Drafts:
     def _draft(
         self, search: FacetSearch, piece: Piece, targets: tuple[int, ...], room: float
     ) -> Draft | _Unfit:
-        """What this piece makes, or why it makes none."""
         located, config, tools = self._located, self._config, self._tools
         facets = [Facet(self._sections, piece.planes, n) for n in range(1, len(piece.planes) + 1)]
         full = [facet for facet in facets if not facet.empty]
@@ -317,23 +315,19 @@ class Drafts:
         healthy = located.of(ORGAN)[::_EVERY]
         surface = cKDTree(located.meshes[name].spread_mm(_SHELL_MM))
         shell = float((surface.query(healthy)[0] < margin_mm).mean())
-        ml = located.organ.volume_ml - sum(located.meshes[name_of(n)].volume_ml
-                                           for n in located.tumors)  # fmt: skip
         notes.append(
             f"a shell of {margin_mm:g} mm alone, which no straight electrode can cut, would be "
-            f"{shell * ml:.1f} ml of healthy tissue."
+            f"{shell * located.parenchyma_ml:.1f} ml of healthy tissue."
         )
         return tuple(notes)
 
     def _why_not(self, reasons: list[_Unfit]) -> str:
-        """That the electrode is too short, or something lies too near to the tumor, or else the
-        best piece's reason."""
         for reason in reasons:
             if reason.tool:
                 return reason.words
         located, name, tools = self._located, name_of(self._label), self._tools
         tumor = cKDTree(located.meshes[name].spread_mm(1.0))
-        surfaces, tight = {**located.meshes, **located.structures}, []
+        surfaces, tight = located.surfaces, []
         for other, mm in keep_mm(located, (self._label,), self._config, 1.0).items():
             points = surfaces[other].spread_mm(1.0)
             gaps = tumor.query(points)[0]
@@ -379,8 +373,7 @@ class Drafts:
 
 
 def _effort(stroke: Stroke, lift: Vector) -> float:
-    """By which strokes of a facet are ordered: depth, mm; an instrument beside the grasper, or that
-    comes from below, is in the arms' way."""
+    """Depth, mm; an instrument beside the grasper, or from below, is in the arms' way."""
     assert stroke.cut.axis is not None
     back = -stroke.cut.axis
     return stroke.depth_mm + _IN_THE_WAY_MM * float(max(back @ lift, 0) + max(-back[2], 0))
@@ -404,3 +397,60 @@ def _unguarded(located: Located, config: ResectionConfig) -> tuple[str, ...]:
     """A note on structures without a distance to keep."""
     others = [name for name in located.structures if name not in config.keep_away]
     return (f"{UNGUARDED} {', '.join(others)}.",) if others else ()
+
+
+def plan_resection(
+    located: Located, config: ResectionConfig, tools: Tools = TOOLS
+) -> ResectionPlan:
+    """A plan by itself, as far as geometry goes; the arms may want another
+    (``arms.procedure.plan_motions``). Raises InputError: no such tumor; NoPlan: nothing to cut, or
+    not as asked."""
+    return Drafts(located, config, tools).best().plan()
+
+
+def chosen_tumor(located: Located, config: ResectionConfig) -> tuple[int, float]:
+    """Label of the tumor to cut out, and its share outside the organ's hull."""
+    if len(located.of(ORGAN)) < _FEWEST:
+        raise NoPlan("no organ was located, so nothing can be planned. Locate it first.")
+    if not located.tumors:
+        raise NoPlan("no tumor was located, so there is nothing to cut out.")
+    names = {name_of(label): label for label in located.tumors}
+    if config.tumor and config.tumor not in names:
+        raise InputError(f"there is no {config.tumor!r}; located were {', '.join(names)}.")
+    candidates = [names[config.tumor]] if config.tumor else list(names.values())
+    shares = exophytic_shares(located, candidates)
+    label = max(shares, key=lambda tumor: shares[tumor])
+    name, n = name_of(label), len(located.of(label))
+    if n < _FEWEST:
+        raise NoPlan(f"{name} has only {n} points; {_FEWEST} are needed. Locate with more points.")
+    if shares[label] < config.least_exophytic:
+        inside = f"{name} lies" if len(candidates) == 1 else "all tumors lie"
+        raise NoPlan(
+            f"{inside} wholly inside the organ ({shares[label]:.0%} outside its hull, "
+            f"{config.least_exophytic:.0%} are needed; least_exophytic in --config allows less)."
+        )
+    needed = (organ_name(located.meshes), *names)
+    if lacking := [part for part in needed if part not in located.meshes]:
+        raise NoPlan(
+            f"{lacking[0] or 'the organ'} has no surface to keep a margin from. Locate it again."
+        )
+    return label, shares[label]
+
+
+def exophytic_shares(located: Located, labels: list[int]) -> dict[int, float]:
+    """How much of each tumor lies outside the convex hull of the organ without tumors, which
+    needs only the farthest point in each of many directions."""
+    organ = located.of(ORGAN)
+    organ = organ[:: 1 + len(organ) // _MOST]
+    farthest = (sphere(_DIRECTIONS).astype(np.float32) @ organ.T.astype(np.float32)).argmax(axis=1)
+    try:
+        hull = ConvexHull(organ[np.unique(farthest)].astype(np.float64))
+    except QhullError as error:
+        raise NoPlan("the organ's points lie in a plane; locate it again.") from error
+    normals, offsets = np.split(hull.equations.astype(np.float32), [3], axis=1)
+    shares = {}
+    for label in labels:
+        points = located.of(label).astype(np.float32)
+        outside = (normals @ points.T + offsets).max(axis=0) > 0
+        shares[label] = float(outside.mean()) if len(points) else 0.0
+    return shares

@@ -1,11 +1,8 @@
-"""Our method: a piece with plane facets, in each of which the whole electrode lies while it cuts.
-
-The electrode is a line, not a point. A plane that touches the convex hull of the tumor, grown by
-the margin, keeps the margin for every line in it, however long the electrode is. So the piece is
-the organ on the inner side of a few such planes, and each facet is swept by an electrode that lies
-in it, its tip on the facet's lower edge. All facets open towards one side, so that the electrode
-cuts nothing but the facet itself, and the piece can be taken out there.
-"""
+"""Our method: the electrode is a line, not a point. A plane that touches the convex hull of the
+tumor, grown by the margin, keeps the margin for every line in it, however long the electrode is.
+So the piece is the organ on the inner side of a few such planes, and each facet is swept by an
+electrode that lies in it, its tip on the lower edge. All open towards one side, so that the
+electrode cuts nothing but the facet, and the piece can be taken out there."""
 
 from __future__ import annotations
 
@@ -44,7 +41,7 @@ _KEEP_MM = 1.5  # between points of what the electrode keeps away from
 
 
 class Tools(NamedTuple):
-    """What the planner has to know of the tools and of what carries the organ, mm."""
+    """What the planner has to know of tools and stand, mm."""
 
     electrode_mm: float = 70.0
     radius_mm: float = 1.2  # of the electrode
@@ -58,8 +55,8 @@ TOOLS = Tools()  # the default cell's
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """One choice of facets, and what it takes: the share of the organ's healthy tissue, kerfs
-    included. ``with_it``: labels of further tumors that come away."""
+    """One choice of facets, and the share of healthy tissue that it takes, kerfs included.
+    ``with_it``: labels of further tumors that come away."""
 
     chosen: Chosen
     planes: Planes
@@ -74,14 +71,9 @@ class Piece:
 
 
 class FacetSearch:
-    """Choices of facets round a tumor, the least healthy tissue first. Table frame, mm.
-
-    Args:
-        located: the organ, whose surfaces and labelled points are used.
-        targets: labels of the tumors that are to come away.
-        keep_mm: what else the electrode keeps away from, with the distances of its surface, mm.
-        like: outward normals (k, 3) of an earlier plan; None: they are searched for.
-    """
+    """Choices of facets round a tumor, the least healthy tissue first. ``targets``: labels of
+    the tumors that are to come away. ``keep_mm``: what else the electrode keeps away from, with
+    distances. ``like``: outward normals of an earlier plan; None: they are searched for."""
 
     def __init__(
         self, located: Located, targets: tuple[int, ...], keep_mm: Mapping[str, float],
@@ -102,13 +94,13 @@ class FacetSearch:
 
     def pieces(self, left_out: Sequence[int] = (), lowest: float = -1.0) -> list[Piece]:
         """The best choices, one for each opening and number of facets, the best first.
-
-        ``left_out``: numbers of normals (``Piece.chosen``) that are not chosen, nor are those near
-        to them. ``lowest``: z of where an electrode comes from, about.
-        """
+        ``left_out``: normals that are not chosen, nor those near to them. ``lowest``: z of where
+        an electrode comes from."""
         choice = self._choice
         if self._like is not None:
-            found = [(tuple(range(len(self._like))), opening_of(self._like))]
+            ways = sphere(_NORMALS)  # away from all planes, as steeply as one can
+            opening = ways[(-(ways @ self._like.T)).min(1).argmax()]
+            found = [(tuple(range(len(self._like))), opening)]
         else:
             alike = self._normals @ self._normals[list(left_out)].T
             choice.barred = (alike > np.cos(np.radians(_ALIKE_DEG))).any(1)
@@ -130,7 +122,7 @@ class FacetSearch:
 
     def _near(self, offsets: np.ndarray) -> list[_Near]:
         """Of each thing to keep away from."""
-        surfaces, tools = {**self._located.meshes, **self._located.structures}, self._tools
+        surfaces, tools = self._located.surfaces, self._tools
         things = [
             (surfaces[name].spread_mm(_KEEP_MM), mm, _TOO_NEAR) for name, mm in self.keep_mm.items()
         ]
@@ -146,8 +138,8 @@ class FacetSearch:
 
 class _Near(NamedTuple):
     """Of every normal, which points of a thing the electrode comes too near to somewhere in its
-    plane, and which lie on its inner side, or so near; packed. ``weight``: points of healthy tissue
-    that one of them outweighs."""
+    plane, and which lie on its inner side, or so near; packed. ``weight``: points of healthy
+    tissue that one of them outweighs."""
 
     near: np.ndarray
     inner: np.ndarray
@@ -273,8 +265,8 @@ class _Choice:
 def keep_mm(
     located: Located, targets: tuple[int, ...], config: ResectionConfig, room: float
 ) -> dict[str, float]:
-    """What the electrode keeps away from beside its targets, with distances in mm: other tumors,
-    by this share of the margin, and what is named."""
+    """Beside its targets, with distances in mm: other tumors, by this share of the margin, and
+    what is named."""
     others = {name_of(n): room * config.margin_mm for n in located.tumors}
     kept = {**others, **config.keep_away}
     return {name: mm for name, mm in kept.items() if name not in map(name_of, targets)}
@@ -292,7 +284,7 @@ def inside(planes: Planes, points_mm: np.ndarray, by_mm: float = 0.0) -> Bool[np
 
 
 def _packed(bits: Bool[np.ndarray, "n m"]) -> np.ndarray:
-    """Bits in words of 64, filled up with zeros (n, m / 64)."""
+    """Bits in words of 64, filled up with zeros."""
     filled = np.zeros((len(bits), -(-bits.shape[1] // 64) * 64), bool)
     filled[:, : bits.shape[1]] = bits
     return np.packbits(filled, axis=1).view(np.uint64)
@@ -310,9 +302,3 @@ def across(direction: Vector) -> Float64[np.ndarray, "2 3"]:
     """Two unit vectors that make a right-handed frame with a third."""
     pair = np.linalg.svd(direction[None])[2][1:]
     return pair if np.linalg.det([*pair, direction]) > 0 else pair[::-1]
-
-
-def opening_of(normals: Float64[np.ndarray, "k 3"]) -> Vector:
-    """The direction that leads away from all planes as steeply as one can."""
-    directions = sphere(_NORMALS)
-    return directions[(-(directions @ normals.T)).min(1).argmax()]

@@ -23,16 +23,7 @@ from tumortrack.live.values import PublishedFrame
 from tumortrack.sense.ply import cloud_ply
 from tumortrack_resection.arms.config import CellConfig
 from tumortrack_resection.budget import ErrorBudget
-from tumortrack_resection.motions import (
-    HOLD,
-    JOINTS,
-    LIFT,
-    PULL,
-    RELEASE,
-    TAUT,
-    Motions,
-    MotionStage,
-)
+from tumortrack_resection.motions import JOINTS, Motions, MotionStage, Stage
 from tumortrack_resection.values import Located, ResectionConfig, ResectionPlan
 
 KIND = "plan"
@@ -46,10 +37,10 @@ _LONGEST_S = 4 * 3600.0  # no resection takes so long
 
 @dataclass(frozen=True, eq=False)
 class PlanFolder:
-    """The content of a plan's folder. ``frames``: in which a live run that carries it out
-    publishes. ``cell``: the workcell of the motions; both are None if no arms were planned.
-    ``case_sha256``: of the case by which the organ was located; empty: unknown. ``frame_source``,
-    ``cell_source``: sha256 of the user's file with the frame, with the bases; or ``INVENTED``."""
+    """The content of a plan's folder. ``frames``: in which a live run publishes. ``cell``: of the
+    motions; both are None if no arms were planned. ``case_sha256``: of the case by which the organ
+    was located; empty: unknown. ``frame_source``, ``cell_source``: sha256 of the user's file with
+    the frame, with the bases; or ``INVENTED``."""
 
     plan: ResectionPlan
     config: ResectionConfig
@@ -67,23 +58,33 @@ class PlanFolder:
     @property
     def located(self) -> Located:
         """What the plan was made on, without its cloud, for pictures and checks."""
-        points, labels = np.zeros((0, 3)), np.zeros(0, np.uint8)
         return Located(
-            points, labels, self.meshes, stamp_ns=self.plan.stamp_ns, patient=self.patient,
-            structures=self.structures,
+            np.zeros((0, 3)), np.zeros(0, np.uint8), self.meshes, stamp_ns=self.plan.stamp_ns,
+            patient=self.patient, structures=self.structures,
         )  # fmt: skip
 
 
-# Fields that plan.json holds under their own names.
-_STORED: dict[str, Any] = {
-    "config": ResectionConfig,
-    "budgets": tuple[ErrorBudget, ...],
-    "cell": CellConfig | None,
-    "case_sha256": str,
-    "frame_source": str,
-    "cell_source": str,
-    "patient": Patient,
-}
+class _Stored(msgspec.Struct, kw_only=True):
+    """plan.json. ``plan``: as ``as_builtins`` has it."""
+
+    frame_id: str
+    table_from_camera: list[list[float]]
+    config: ResectionConfig
+    case_sha256: str
+    patient: Patient
+    frame_source: str
+    cell_source: str
+    camera_frame_id: str
+    table_in_camera: tuple[float, float, float, float] | None
+    plan: dict[str, Any]
+    budgets: tuple[ErrorBudget, ...]
+    structures: list[str]
+    cell: CellConfig | None
+    seconds: float | None
+
+
+# Fields of both under their own names
+_ALIKE = ("config", "budgets", "cell", "case_sha256", "frame_source", "cell_source", "patient")
 
 
 def check_structures(names: Collection[str]) -> None:
@@ -96,36 +97,24 @@ def check_structures(names: Collection[str]) -> None:
 
 
 def write_plan(
-    folder: Path,
-    content: PlanFolder,
-    inputs: dict[str, str],
-    more: Callable[[Path], None],
+    folder: Path, content: PlanFolder, inputs: dict[str, str], more: Callable[[Path], None],
     overwrite: bool = False,
-) -> None:
-    """All or nothing. ``inputs``: sha256 of what it was made from; ``more`` adds files (pictures)
-    to a folder. Raises InputError: the folder exists and ``overwrite`` is False; NoPlan: motions
-    that would be refused when read; StorageError: the disk refused."""
+) -> None:  # fmt: skip
+    """All or nothing. ``inputs``: sha256 of what it was made from; ``more`` adds files to a folder.
+    Raises InputError: the folder exists and ``overwrite`` is False; NoPlan: motions that would be
+    refused when read; StorageError: the disk refused."""
     plan, motions, frames = content.plan, content.motions, content.frames
     if motions is not None:
         assert content.cell is not None
         for fault in _faults(motions, content.cell, plan.sweeps):
             raise NoPlan(f"the arms can't carry this out: {fault}.")
-    data = {
-        "frame_id": frames.frame_id,
-        "table_from_camera": frames.published_from_camera.tolist(),
-        "config": content.config,
-        "case_sha256": content.case_sha256,
-        "patient": content.patient,
-        "frame_source": content.frame_source,
-        "cell_source": content.cell_source,
-        "camera_frame_id": frames.camera_frame_id,
-        "table_in_camera": frames.table_in_camera,
-        "plan": as_builtins(plan),
-        "budgets": content.budgets,
-        "structures": list(content.structures),
-        "cell": content.cell,
-        "seconds": motions and motions.seconds,
-    }
+    data = _Stored(
+        frame_id=frames.frame_id, table_from_camera=frames.published_from_camera.tolist(),
+        camera_frame_id=frames.camera_frame_id, table_in_camera=frames.table_in_camera,
+        plan=as_builtins(plan), structures=list(content.structures),
+        seconds=None if motions is None else motions.seconds,
+        **{name: getattr(content, name) for name in _ALIKE},
+    )  # fmt: skip
     with store.new_folder(folder, overwrite) as aside:
         store.write_json(aside / _NAME, msgspec.to_builtins(data))
         store.write_atomically(aside / _STROKES, _strokes(plan))
@@ -152,28 +141,26 @@ def read_plan(folder: Path) -> PlanFolder:
     piece = meshes.pop(_PIECE, None)
     motions = _read_motions(path) if path.is_file() else None
     try:
-        structures = {name: meshes.pop(name) for name in data["structures"]}
-        plan = from_plain(data["plan"], piece)
-        read = {name: msgspec.convert(data[name], kind) for name, kind in _STORED.items()}
+        read = msgspec.convert(data, _Stored)
+        structures = {name: meshes.pop(name) for name in read.structures}
+        plan, pose = from_plain(read.plan, piece), np.array(read.table_from_camera, float)
         frames = PublishedFrame(
-            str(data["frame_id"]),
-            np.array(data["table_from_camera"], float),
-            read["frame_source"] != INVENTED,
-            str(data["camera_frame_id"]),
-            msgspec.convert(data["table_in_camera"], tuple[float, float, float, float] | None),
-        )
+            read.frame_id, pose, read.frame_source != INVENTED, read.camera_frame_id,
+            read.table_in_camera,
+        )  # fmt: skip
     except (KeyError, TypeError, ValueError, InputError, msgspec.ValidationError) as error:
         raise ArtifactError(f"{folder / _NAME} lacks or spoils {error}; plan again.") from error
-    parts = [budget.part for budget in read["budgets"]]
+    parts = [budget.part for budget in read.budgets]
     if parts[:1] != [plan.tumor] or {*parts} != {name for name in meshes if is_tumor(name)}:
         raise ArtifactError(f"{folder / _NAME} lacks a tumor's error budget; plan again.")
     if motions is not None:
-        if read["cell"] is None:
+        if read.cell is None:
             raise ArtifactError(f"{folder} has motions and no cell that they are for. Plan again.")
-        for fault in _faults(motions, read["cell"], plan.sweeps):
+        for fault in _faults(motions, read.cell, plan.sweeps):
             raise ArtifactError(f"{path} can't be carried out: {fault}. Plan again.")
+    alike = {name: getattr(read, name) for name in _ALIKE}
     return PlanFolder(
-        plan=plan, frames=frames, meshes=meshes, motions=motions, structures=structures, **read
+        plan=plan, frames=frames, meshes=meshes, motions=motions, structures=structures, **alike
     )
 
 
@@ -252,8 +239,7 @@ def _read_motions(path: Path) -> Motions:
 
 
 def ros_trajectories(motions: Motions, frame_id: str) -> bytes:
-    """Motions for MoveIt as JSON, which ROS 2 reads as YAML: ``stages`` with ``name``, ``seconds``
-    and the ``trajectory`` of all joints, without stages in which none moves; radians, seconds."""
+    """Motions for MoveIt as JSON, which ROS 2 reads as YAML, without stages in which none moves."""
     stages = [
         {"name": stage.name, "seconds": stage.seconds, "trajectory": _trajectory(stage, frame_id)}
         for stage in motions.stages
@@ -284,8 +270,8 @@ def _faults(motions: Motions, cell: CellConfig, sweeps: int) -> Iterator[str]:
     """What the planner would not do."""
     names = [stage.name for stage in motions.stages]
     cuts = [f"sweep {n}" for n in range(1, sweeps + 1)]
-    pull = [PULL, TAUT] if cell.pull_mm else []
-    if names != ["approach", "grasp", HOLD, *pull, *cuts, LIFT, RELEASE, "home"]:
+    pull = [Stage.PULL, Stage.TAUT] if cell.pull_mm else []
+    if names != ["approach", "grasp", Stage.HOLD, *pull, *cuts, Stage.LIFT, Stage.RELEASE, "home"]:
         yield f"its stages are {', '.join(names) or 'none'}"
     for stage in motions.stages:
         if not (np.isfinite(stage.times_s).all() and np.isfinite(stage.joints_rad).all()):

@@ -19,23 +19,16 @@ Place = Float64[np.ndarray, " 3"]
 
 
 class _Taken(NamedTuple):
-    """The point of the CT that was taken, and its standard deviation then."""
-
     point_ct: tuple[float, float, float]
     std_mm: float
 
 
 class Grip:
-    """From the end of the stage hold until the piece is lifted, the holder's tip is where one point
-    of the CT is: the one that the last good estimate before had where the cup gripped.
-
-    Args:
-        tip_mm: from an arm's name and its six joints to its tip, published frame.
-        std_mm: one standard deviation of the tip's way since then, along any axis.
-
-    Attributes:
-        pulled_mm: how far the holder has moved since it gripped; other threads may read it.
-    """
+    """From the end of the stage hold until the piece is lifted, the holder's tip is where one
+    point of the CT is: the one that the last good estimate before had where the cup gripped.
+    ``tip_mm``: from an arm's name and its six joints to its tip. ``std_mm``: of the tip's way
+    since then, along any axis. ``pulled_mm``: how far the holder has moved; other threads may
+    read it."""
 
     def __init__(
         self, tip_mm: Callable[[str, Float64[np.ndarray, " 6"]], Place], std_mm: float
@@ -79,8 +72,8 @@ class Grip:
 
 
 def held_std_mm(budget: ErrorBudget) -> float:
-    """Of the holder's way since it gripped: the tool's bound counts as three standard deviations.
-    The hand-eye calibration's error is in both ends of the way alike."""
+    """The tool's bound counts as three standard deviations of the holder's way. The hand-eye
+    calibration's error is in both ends of the way alike."""
     return budget.tool_mm / 3
 
 

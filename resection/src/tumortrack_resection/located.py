@@ -29,10 +29,9 @@ STAND_MM = 120.0  # height of the organ's lowest point over the table, if unknow
 
 
 def table_under(meshes: Mapping[str, Mesh], stand_mm: float) -> Float64[np.ndarray, "4 4"]:
-    """``table_from_camera`` of a camera that looks straight down on the organ (surfaces in its
-    frame), whose lowest point is ``stand_mm`` above the table. x points to the right of the image,
-    y to its top, z towards the camera; the origin lies on the table below the organ's centre.
-    NoPlan: there is no organ."""
+    """``table_from_camera`` of a camera that looks straight down on the organ, whose lowest
+    point is ``stand_mm`` above the table: x to the right of the image, y to its top, the origin
+    below the organ's centre. NoPlan: there is no organ."""
     low, high = organ_surface(meshes).box_mm
     x, y, _ = (low + high) / 2
     return rigid(np.diag([1.0, -1.0, -1.0]), np.array([-x, y, high[2] + stand_mm]))
@@ -58,7 +57,7 @@ def _bounds_mm(assessment: Assessment) -> dict[str, float]:
 
 
 def poor_estimate_notes(doubt: str, accept_poor: bool) -> tuple[str, ...]:
-    """A plan's notes on its estimate. InputError: the estimate is poor, and was not accepted."""
+    """InputError: the estimate is poor, and was not accepted."""
     if not doubt:
         return ()
     if not accept_poor:

@@ -1,9 +1,10 @@
 """Motions of both arms, stage by stage, as joint angles over time; and their execution, a state
-machine without a clock of its own that halts smoothly at any time."""
+machine without a clock that halts smoothly at any time."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 from jaxtyping import Float64
@@ -16,26 +17,29 @@ CUTTER, HOLDER = "cutter", "holder"  # UR10e with the instrument, UR5 with the v
 ARMS = (CUTTER, HOLDER)
 Joints = Float64[np.ndarray, " 12"]  # radians, in the order of ``JOINTS``
 JOINTS = tuple(f"{arm}_{joint}" for arm in ARMS for joint in UR_JOINTS)
-DONE, ABORTED = "done", "aborted"
-HOLD, LIFT, RELEASE = "hold", "lift", "release"
-WITHDRAW = "withdraw"  # only of motions that were planned again, with an instrument in the tissue
-PULL, TAUT = "pull", "taut"  # with a pull, between hold and the first sweep
 _BRAKE_RAD_S2 = 4.0  # deceleration of the fastest joint when arms halt during a motion
 _SHORTEST_BRAKE_S = 0.1
 _CATCH_UP_S = 0.3  # three times the servo's lookahead; the way in to a cut takes longer
 
 
+class Stage(StrEnum):
+    """Names of stages, and of the states after the last; sweeps have numbers."""
+
+    HOLD = "hold"
+    PULL = "pull"  # with a pull, between hold and the first sweep
+    TAUT = "taut"
+    LIFT = "lift"
+    RELEASE = "release"
+    WITHDRAW = "withdraw"  # only of motions that were planned again, with an instrument in tissue
+    DONE = "done"
+    ABORTED = "aborted"
+
+
 @dataclass(frozen=True, eq=False)
 class MotionStage:
-    """One state of the procedure: approach, grasp, hold, perhaps pull and taut, sweep 1, sweep 2,
-    ..., lift, release, home.
-
-    Attributes:
-        times_s: rising from 0; one entry where nothing moves.
-        joints_rad: of all twelve joints in the order of ``JOINTS``; between two times they change
-            linearly.
-        cutting: True at the times at which the instrument's tip is on a cut (n,).
-    """
+    """One state of the procedure: approach, grasp, hold, perhaps pull and taut, sweep 1, ...,
+    lift, release, home. ``times_s``: rising from 0; between two times all twelve joints change
+    linearly. ``cutting``: whether the instrument's tip is on a cut."""
 
     name: str
     times_s: Float64[np.ndarray, " n"]
@@ -55,11 +59,10 @@ class MotionStage:
 
     @property
     def sweep(self) -> int:
-        """The sweep's number, from 1; 0: the stage is no sweep."""
+        """From 1; 0: the stage is no sweep."""
         return int(self.name.removeprefix("sweep ")) if self.name.startswith("sweep ") else 0
 
     def at(self, time_s: float) -> Joints:
-        """Joint angles at a time after the stage began."""
         return np.array([np.interp(time_s, self.times_s, joint) for joint in self.joints_rad.T])
 
 
@@ -75,12 +78,9 @@ class Motions:
 
 
 class Execution:
-    """Executes motions. ``step`` advances time; ``halt`` slows the arms down to a stop on their
-    path, ``go`` resumes; ``abort`` is a halt for good.
-
-    ``state`` is the name of the stage, ``done`` or ``aborted``; ``halted`` is why the arms stand or
-    slow down, else None; ``gripped_rad`` are the joints at the end of hold, None before.
-    """
+    """``step`` advances time; ``halt`` slows the arms down to a stop on their path, ``go``
+    resumes; ``abort`` is a halt for good. ``halted``: why the arms stand or slow down;
+    ``gripped_rad``: the joints at the end of hold."""
 
     def __init__(self, motions: Motions) -> None:
         self._motions = motions
@@ -93,12 +93,11 @@ class Execution:
     @property
     def state(self) -> str:
         if self._aborted:
-            return ABORTED
-        return DONE if self._over else self._stage.name
+            return Stage.ABORTED
+        return Stage.DONE if self._over else self._stage.name
 
     @property
     def ended(self) -> bool:
-        """Nothing will move any more."""
         return self._over or (self._aborted and self.still)
 
     @property
@@ -107,11 +106,11 @@ class Execution:
 
     @property
     def sweep(self) -> int:
-        """Number of the current sweep; 0 before the first; after the last, the number of sweeps
-        plus 1."""
+        """0 before the first; after the last, the number of sweeps plus 1."""
         stages = self._motions.stages
         past = max(stage.sweep for stage in stages[: self._number + 1])
-        if not past and self.holds and self._first(HOLD, -1) < 0:  # withdraws before it goes on
+        before = self._first(Stage.HOLD, -1) < 0  # withdraws before it goes on
+        if not past and self.holds and before:
             return next((stage.sweep for stage in stages if stage.sweep), 0)
         after = self._over or not self._stage.sweep
         return past + 1 if past and after else past
@@ -119,16 +118,17 @@ class Execution:
     @property
     def holds(self) -> bool:
         """The holder has been at the grasp point: the state is hold or later."""
-        return self._number >= self._first(HOLD, 0)
+        return self._number >= self._first(Stage.HOLD, 0)
 
     @property
     def grips(self) -> bool:
         """The cup has hold of the organ: from the end of hold until the piece is lifted."""
-        return self._first(HOLD, -1) < self._number < self._first(LIFT, len(self._motions.stages))
+        lift = self._first(Stage.LIFT, len(self._motions.stages))
+        return self._first(Stage.HOLD, -1) < self._number < lift
 
     @property
     def stage(self) -> str:
-        """The name of the stage, also of an aborted one."""
+        """Its name, also of an aborted one."""
         return self._stage.name
 
     @property
@@ -144,24 +144,21 @@ class Execution:
         return self._stage.at(self._time_s)
 
     def go(self) -> None:
-        """Resume the motion, or begin."""
         if not self._aborted:
             self.halted = None
 
     def halt(self, reason: Halt) -> None:
-        """Slow down to a stop."""
         if not self._aborted:
             self.halted = reason
 
     def abort(self, reason: Halt) -> None:
-        """Slow down to a stop for good; no effect once everything has ended."""
+        """No effect once everything has ended."""
         if not self._over:
             self.halt(reason)
             self._aborted = True
 
     def replace(self, motions: Motions) -> None:
-        """Continue with other motions; InputError: they begin elsewhere than where the arms are, or
-        the arms are moving."""
+        """Continue with other motions; InputError: they begin elsewhere, or the arms are moving."""
         if not self.still:
             raise InputError("motions can be replaced only while the arms stand.")
         off = np.abs(motions.stages[0].joints_rad[0] - self.joints_rad).max()
@@ -170,7 +167,6 @@ class Execution:
         self._motions, self._number, self._time_s = motions, 0, 0.0
 
     def step(self, seconds: float) -> None:
-        """Advance time."""
         if not seconds >= 0:
             raise InputError(f"time goes forward; {seconds:g} s does not.")
         while seconds > 0 and not self._over:
@@ -181,13 +177,12 @@ class Execution:
             self._speed += float(np.clip(target - before, -most, most))
             self._time_s += change * (before + self._speed) / 2
             while not self._over and self._time_s >= (length_s := self._stage.seconds):
-                if self._stage.name == HOLD:
+                if self._stage.name == Stage.HOLD:
                     self.gripped_rad = self._stage.joints_rad[-1]
                 self._number += 1
                 self._time_s = length_s if self._over else self._time_s - length_s
 
     def _brake_s(self) -> float:
-        """Time to come to rest at the brake's deceleration."""
         stage = self._stage
         here = int(np.searchsorted(stage.times_s, self._time_s, side="right"))
         around = slice(max(0, here - 3), here + 3)
@@ -198,7 +193,7 @@ class Execution:
         return max(_SHORTEST_BRAKE_S, float(speed) / _BRAKE_RAD_S2)
 
     def _first(self, name: str, without: int) -> int:
-        """The number of a stage; ``without``: where there is none."""
+        """``without``: where there is none."""
         names = [stage.name for stage in self._motions.stages]
         return names.index(name) if name in names else without
 

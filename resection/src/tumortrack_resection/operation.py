@@ -1,7 +1,5 @@
 """A plan carried out beside the live loop: halted by every doubt, replanned if the tumor moved.
-
-It has no clock but the arrival of updates: ``act`` is called with every one.
-"""
+It has no clock but the arrival of updates."""
 
 from __future__ import annotations
 
@@ -28,19 +26,9 @@ from tumortrack.core.halt import CUT_NOTE, Halt
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import Polyline, RigidShape, TrackingResult, Workcell
 from tumortrack.registration.advice import Place, Reach
-from tumortrack_resection.budget import MOVED_MM
+from tumortrack_resection.budget import MOVED_MM, LiveBudget
 from tumortrack_resection.grip import Grip
-from tumortrack_resection.live_budget import LiveBudget
-from tumortrack_resection.motions import (
-    ABORTED,
-    CUTTER,
-    JOINTS,
-    PULL,
-    TAUT,
-    Execution,
-    Joints,
-    Motions,
-)
+from tumortrack_resection.motions import CUTTER, JOINTS, Execution, Joints, Motions, Stage
 from tumortrack_resection.values import ELECTRODE, Located, ResectionPlan
 
 _OTHER_PARTS = 2.0  # they may move so many times as far as the tumor
@@ -54,12 +42,9 @@ class OperationConfig(Config, frozen=True, kw_only=True):
     """When to halt the arms and when to replan.
 
     Attributes:
-        moved_mm: the tumor has moved if its surface is this far from where it was planned (root
-            mean square).
-        settled_mm, settled_s: a new plan waits until the tumor has moved no more than that for so
-            long.
-        replan_cut: replan on the intact organ's model even after the first sweep has begun;
-            otherwise the arms halt then.
+        moved_mm: of the tumor's surface, root mean square: then it counts as moved.
+        settled_mm, settled_s: a new plan waits until it has moved no more than that for so long.
+        replan_cut: replan on the intact organ's model even after the first sweep has begun.
         speed: factor on the motions' speed.
     """
 
@@ -87,13 +72,13 @@ class Planned:
 
     @property
     def kept_mm(self) -> dict[str, float]:
-        """The electrode's least distance to each tumor that it must not come near to, as checked;
-        of structures it is no matter of errors in tumors' places."""
+        """The electrode's least distance to each tumor, as checked; of structures it is no
+        matter of errors in tumors' places."""
         return {name: mm for name, mm in self.plan.least_mm.items() if name in self.meshes}
 
 
 class ResectionProgress(NamedTuple):
-    """How far a plan was carried out: whether the grasper holds, and how many sweeps are done."""
+    """Whether the grasper holds, and how many sweeps are done."""
 
     holds: bool = False
     done: int = 0
@@ -113,16 +98,10 @@ ReachOf = Callable[[Mesh, Joints], Reach]
 
 
 class Following(NamedTuple):
-    """What an operation that follows the organ needs.
-
-    Attributes:
-        locate: an update's estimate in the table's frame; None: estimates are ignored.
-        replan: begins a new plan in another process, so that the loop continues meanwhile.
-        budget: adds up the errors of every update; None: they are ignored.
-        grip: what the holder holds, as evidence of where the organ is; None: it gives none.
-        reach: touches are advised for the plan's tumor, where the arms can take them; None: as they
-            come.
-    """
+    """What an operation that follows the organ needs. ``locate``: an update's estimate in the
+    table's frame; None: estimates are ignored. ``replan``: begins a new plan in another process.
+    ``budget``: adds up the errors. ``grip``: what the holder holds, as evidence. ``reach``:
+    touches are advised where the arms can take them."""
 
     locate: Locate | None = None
     replan: Replan | None = None
@@ -135,24 +114,12 @@ _UNSEEING = Following()
 
 
 class Operation:
-    """``live.values.ArmsController``: arms that act on estimates.
-
-    Args:
-        planned: the plan to begin with.
-        draw: arms, table and tools as shapes, from twelve joint angles.
-
-    Attributes:
-        planned: the current plan.
-        static_shapes: drawn with every update.
-        log: states and when they began. ``halts``: how often each reason halted the arms.
-    """
+    """``live.values.ArmsController``: arms that act on estimates. ``draw``: arms, table and
+    tools as shapes, from twelve joint angles. ``static_shapes``: drawn with every update.
+    ``log``: states and when they began. ``halts``: how often each reason halted the arms."""
 
     def __init__(
-        self,
-        planned: Planned,
-        config: OperationConfig,
-        draw: Draw,
-        live: Following = _UNSEEING,
+        self, planned: Planned, config: OperationConfig, draw: Draw, live: Following = _UNSEEING
     ) -> None:
         self.planned, self._config = planned, config
         self._warnings = planned.plan.warnings  # also of later plans: the budget stays accepted
@@ -180,7 +147,7 @@ class Operation:
         return ResectionProgress(execution.holds, max(0, execution.sweep - 1))
 
     def act(self, update: TrackingResult, now_s: float | None = None) -> TrackingResult:
-        """The update with the arms' present state. ``now_s``: time of a monotonic clock."""
+        """The update with the arms' present state."""
         now_s = time.monotonic() if now_s is None else now_s
         self._advance(now_s)
         self._decide(update, now_s)
@@ -216,12 +183,11 @@ class Operation:
         return estimate.assessed(next_evidence=worthwhile(advice))
 
     def evidence(self, camera_from_published: Affine, stamp_ns: int) -> tuple[Evidence, ...]:
-        """Where the holder has the tissue that it grips, in a frame of the camera."""
+        """Where the holder has the tissue that it grips."""
         return () if self._grip is None else self._grip.evidence(camera_from_published, stamp_ns)
 
     @property
     def halt(self) -> Halt | None:
-        """Why the arms stand or slow down; None: they don't."""
         return self._execution.halted
 
     def abort(self, halt: Halt) -> None:
@@ -229,7 +195,6 @@ class Operation:
         self._execution.abort(halt)
 
     def workcell(self) -> Workcell:
-        """State, joints and drawing of the arms."""
         execution, plan = self._execution, self.planned.plan
         joints, sweep = execution.joints_rad, execution.sweep
         lines = []
@@ -263,7 +228,6 @@ class Operation:
         return "; ".join([*heads, *([CUT_NOTE] if self._cut and self._locate is not None else [])])
 
     def summary(self) -> dict[str, Any]:
-        """For the report: states and when they began, halts, new plans."""
         return {
             "state": self._execution.state,
             "note": self._note,
@@ -274,7 +238,6 @@ class Operation:
         }
 
     def _advance(self, now_s: float) -> None:
-        """Advance by the time since the last update."""
         if self._last_s is None:
             self._last_s = self._first_s = now_s
         elapsed_s, speed = max(0.0, now_s - self._last_s), self._config.speed
@@ -286,13 +249,12 @@ class Operation:
         self._cut |= self._execution.sweep > 0
 
     def _decide(self, update: TrackingResult, now_s: float) -> None:
-        """Go on or halt."""
         execution = self._execution
         if self._budget is not None:
             self._budget.forget()
         if self._work is not None:
             self._take_work(self._work, now_s)
-        over = execution.ended or execution.state == ABORTED
+        over = execution.ended or execution.state == Stage.ABORTED
         if self._locate is None or over or execution.sweep > self.planned.plan.sweeps:
             execution.go()  # nothing to compare, nothing moves any more, or all is cut
         elif update.estimate is None:
@@ -303,7 +265,7 @@ class Operation:
             self._halt_unsettled(Halt("poor", {"words": update.warning}, update.finding))
         elif self._work is not None:
             execution.halt(Halt("planning"))
-        elif execution.stage == PULL:
+        elif execution.stage == Stage.PULL:
             execution.go()  # the tumor moves because it is pulled; it is planned on when taut
         else:
             self._compare(update, self._locate(update), now_s)
@@ -352,7 +314,7 @@ class Operation:
         return Halt("restless", {**halt.values, "seconds": now_s - self._off_s})
 
     def _reason_to_halt(self, update: TrackingResult, located: Located) -> tuple[Halt | None, bool]:
-        """Why the arms must halt (None: they need not), and whether a new plan would help."""
+        """And whether a new plan would help."""
         name, moved = self.planned.plan.tumor, []
         over_budget: tuple[Halt | None, bool] = None, False
         for part, mesh in self.planned.meshes.items():
@@ -369,14 +331,15 @@ class Operation:
         if moved:
             _, off_mm, part = max(moved)  # the tumor, or else what moved farthest
             return Halt("moved", {"part": part, "off_mm": off_mm}), True
-        if over_budget[0] is None and self._execution.stage == TAUT and self._replan is not None:
+        taut = self._execution.stage == Stage.TAUT and self._replan is not None
+        if over_budget[0] is None and taut:
             return Halt("planning"), True  # however little the pull has moved it
         return over_budget
 
     def _take_work(self, work: Future[Planned], now_s: float) -> None:
         """Take over the new plan once it is ready; stop for good if planning failed."""
         execution = self._execution
-        if execution.state == ABORTED:
+        if execution.state == Stage.ABORTED:
             self._work = None
             work.cancel()
             return
@@ -409,8 +372,8 @@ def _slipped(update: TrackingResult) -> Halt | None:
 
 
 def apart_mm(a: Mesh, b: Mesh) -> float:
-    """How far a surface has moved, root mean square: of its vertices if the triangles are the same,
-    else between the surfaces, which ignores sliding along the surface."""
+    """How far a surface has moved, root mean square: of its vertices if the triangles are the
+    same, else between the surfaces."""
     return float(np.sqrt((_distances_mm(a, b) ** 2).mean()))
 
 

@@ -1,4 +1,5 @@
-"""Outlines in the table's plane: hulls of projected points, grown, clipped, and sampled."""
+"""Outlines in the table's plane, and the paper's method (its section "Integration with Robotic
+Resection"), which knows the tip alone."""
 
 from __future__ import annotations
 
@@ -13,6 +14,7 @@ from shapely import Polygon
 from shapely.geometry.polygon import orient
 
 from tumortrack.core.errors import NoPlan
+from tumortrack_resection.values import Cut, Located, ResectionConfig
 
 _CELL = 2.0  # of a grid that separates inner from outer points, in sqrt(area / number of points)
 _EDGE = 5.0  # longest edge of a hull, in sqrt(area / number of points)
@@ -24,11 +26,9 @@ _SMOOTH = 16  # corners of a quarter circle: 5 mm of margin are exact to 0.01 mm
 
 
 def concave_hull(points_mm: Float[np.ndarray, "n 2"]) -> Polygon:
-    """The outline of a cloud's largest cluster.
-
-    Edges are at most 5 sqrt(A / n) long, with the convex hull's area A: GEOS's fixed ratio would
-    mean another length at every density. Raises NoPlan: fewer than three points, or all on a
-    line."""
+    """The outline of a cloud's largest cluster. Edges are at most 5 sqrt(A / n) long, with the
+    convex hull's area A: GEOS's fixed ratio would mean another length at every density. Raises
+    NoPlan: fewer than three points, or all on a line."""
     points = np.asarray(points_mm, float)
     if len(points) > _MOST:
         points = points[np.linspace(0, len(points) - 1, _MOST).astype(int)]
@@ -49,12 +49,10 @@ def concave_hull(points_mm: Float[np.ndarray, "n 2"]) -> Polygon:
 
 
 def grown(outline: Polygon, margin_mm: float) -> Polygon:
-    """All within ``margin_mm`` of an outline."""
     return _largest(outline.buffer(margin_mm, quad_segs=_SMOOTH))
 
 
 def common(a: Polygon, b: Polygon) -> Polygon:
-    """The largest common piece; NoPlan: there is none."""
     return _largest(a.intersection(b))
 
 
@@ -65,24 +63,33 @@ def evenly(ring_mm: Float[np.ndarray, "n 2"], spacing_mm: float) -> Float64[np.n
     return shapely.get_coordinates(shapely.line_interpolate_point(line, shares, normalized=True))
 
 
-def rings_of(area: Any) -> tuple[Float64[np.ndarray, "n 2"], ...]:
-    """The outer rings of a polygon or several, anticlockwise, first points not repeated, largest
-    first."""
-    pieces = [piece for piece in _polygons(area) if piece.area >= _LEAST_MM2]
-    pieces.sort(key=lambda piece: -piece.area)
-    return tuple(np.array(orient(piece).exterior.coords)[:-1, :2] for piece in pieces)
-
-
-def _polygons(area: Any) -> list[Polygon]:
-    """The polygons in a geometry of any kind."""
-    if area.geom_type == "Polygon":
-        return [] if area.is_empty else [area]
-    return [piece for piece in getattr(area, "geoms", ()) if piece.geom_type == "Polygon"]
+def published_cuts(
+    located: Located, label: int, config: ResectionConfig
+) -> tuple[tuple[Cut, ...], Float64[np.ndarray, "n 2"], float, Float64[np.ndarray, " 3"]]:
+    """The paper's strokes (its section II-D), the outline and the lower end of the piece, and
+    the grasp point. The tumor's points are projected on the table's plane; their concave hull,
+    grown by the margin and clipped to the organ's projection, is cut along at the middle of the
+    tumor's bounding box, and on its lower face. Held is the tumor's centre of mass, carried up
+    to the top of the box. NoPlan: there is no contour."""
+    tumor = located.of(label)
+    low, high = float(tumor[:, 2].min()), float(tumor[:, 2].max())
+    wide = grown(concave_hull(tumor[:, :2]), config.margin_mm)
+    both = common(wide, concave_hull(located.points_mm[:, :2]))
+    ring = np.array(orient(both).exterior.coords)[:-1]
+    flat = evenly(np.concatenate([ring, ring[:1]]), config.spacing_mm)
+    heights = ((low + high) / 2, low)
+    cuts = tuple(
+        Cut(sweep, np.column_stack([flat, np.full(len(flat), height)]))
+        for sweep, height in enumerate(heights, start=1)
+    )
+    x, y, _ = tumor.mean(0)
+    return cuts, ring, low, np.array([x, y, high], float)
 
 
 def _largest(area: Any) -> Polygon:
     """The largest polygon, without its holes: what lies in them comes away too."""
-    largest = max(_polygons(area), key=lambda piece: piece.area, default=Polygon())
+    polygons = [part for part in shapely.get_parts(area) if part.geom_type == "Polygon"]
+    largest = max(polygons, key=lambda piece: piece.area, default=Polygon())
     if largest.area < _LEAST_MM2:
         raise NoPlan("the outline has no area; there is no contour to cut along.")
     return Polygon(largest.exterior)
@@ -96,8 +103,8 @@ def first_in_cell(cells: Int[np.ndarray, "n d"]) -> Int[np.ndarray, " m"]:
 
 
 def _outer(points: np.ndarray, cell_mm: float) -> np.ndarray:
-    """Points of the largest cluster (cells that touch each other, about four points each) that
-    matter for its outline: those in cells next to an empty one, and a few others."""
+    """Points of the largest cluster that matter for its outline: those in cells next to an empty
+    one, and a few others."""
     i, j = ((points - points.min(0)) / cell_mm).astype(int).T
     some = np.zeros((i.max() + 1, j.max() + 1), bool)
     some[i, j] = True

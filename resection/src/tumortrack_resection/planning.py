@@ -14,21 +14,23 @@ import numpy as np
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins
 from tumortrack.core.errors import InputError, NoPlan
+from tumortrack.core.estimate import Estimate
 from tumortrack.core.packages import to_install
 from tumortrack.core.types import Mesh
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.values import PublishedFrame
 from tumortrack.tracking.options import options_from
 from tumortrack_resection.arms.config import CellConfig
-from tumortrack_resection.budget import (
-    MOVED_MM,
-    ErrorBudget,
-    checked_against,
-    planned_budgets,
-)
+from tumortrack_resection.budget import MOVED_MM, ErrorBudget, checked_against, planned_budgets
 from tumortrack_resection.drafts import Drafts
 from tumortrack_resection.files import INVENTED, PlanFolder, check_structures, write_plan
-from tumortrack_resection.located import poor_estimate_notes, read_run, table_under
+from tumortrack_resection.located import (
+    STAND_MM,
+    of_estimate,
+    poor_estimate_notes,
+    read_run,
+    table_under,
+)
 from tumortrack_resection.operation import OperationConfig
 from tumortrack_resection.options import PlanOptions
 from tumortrack_resection.values import WEAK_CASE, Located, ResectionConfig, ResectionPlan
@@ -37,15 +39,8 @@ from tumortrack_resection.values import WEAK_CASE, Located, ResectionConfig, Res
 @dataclass(frozen=True, eq=False)
 class Planning:
     """A plan, step by step: the cuts are there; ``checked`` or ``with_motions``, and ``save``
-    follow.
-
-    Attributes:
-        content: of the plan's folder, so far.
-        cell: the requested workcell.
-        bases_source: of the arms' bases in it, as ``PlanFolder.cell_source``.
-        cuts: as planned without the arms.
-        note: what was changed in the cell for the motions; empty: nothing.
-    """
+    follow. ``cell``: the requested one; ``bases_source``: as ``PlanFolder.cell_source``;
+    ``note``: what was changed in the cell for the motions."""
 
     content: PlanFolder
     run_folder: Path
@@ -57,23 +52,22 @@ class Planning:
 
     @property
     def located(self) -> Located:
-        """Organ and tumors, in the plan's frame."""
         return self.cuts.located
 
     def checked(self) -> Planning:
-        """Unchecked, without motions, with a note on the error budget. NoPlan: the distances don't
-        cover the errors, and that was not accepted."""
+        """Without motions, with a note on the error budget. NoPlan: the distances don't cover
+        the errors, and that was not accepted."""
         budgets = self.cuts.budgets_of(self.content.plan)
         plan = checked_against(self.content.plan, budgets, self.options.accept_budget)
         return replace(self, content=replace(self.content, plan=plan, budgets=budgets))
 
     def with_motions(self) -> Planning:
-        """With the motions of both arms, checked, and the plan that these carry out. NoPlan: they
-        can't carry one out, or the check refuses it, or as ``checked``."""
+        """And the plan that these carry out. NoPlan: the arms can't carry one out, or the check
+        refuses it, or as ``checked``."""
         from tumortrack_resection.arms.body import cell_urdf
         from tumortrack_resection.arms.procedure import search_bases
         from tumortrack_resection.arms.trajectory import first_hit
-        from tumortrack_resection.checking import checked
+        from tumortrack_resection.check import checked
         from tumortrack_resection.motions import ARMS
 
         organ, config = self.located.organ, self.content.config
@@ -94,21 +88,15 @@ class Planning:
 
         cell, motions = self.content.cell, self.content.motions
 
-        def pictures(aside: Path) -> None:
-            poses_mm = None
+        def more(aside: Path) -> None:
             if cell is not None and motions is not None:
                 from tumortrack_resection.arms.body import cell_urdf
-                from tumortrack_resection.check import electrode_poses
 
-                urdf = cell_urdf(cell)
-                store.write_atomically(aside / "cell.urdf", urdf.encode())
-                ends_mm, energised = electrode_poses(urdf, motions)
-                poses_mm = ends_mm[energised]
-            path = aside / "plan.png"
-            draw_plan(self.content.plan, self.located, path, self.cell.tools, poses_mm)
+                store.write_atomically(aside / "cell.urdf", cell_urdf(cell).encode())
+            draw_plan(self.content.plan, self.located, aside / "plan.png", self.cell.tools)
 
         digest = store.sha256_of(self.run_folder / store.MANIFEST)
-        write_plan(folder, self.content, {"run": digest}, pictures, overwrite)
+        write_plan(folder, self.content, {"run": digest}, more, overwrite)
 
 
 def begin_plan(run_folder: str | Path, **given: Any) -> Planning:
@@ -151,9 +139,8 @@ def begin_plan(run_folder: str | Path, **given: Any) -> Planning:
 
 
 class Cuts(NamedTuple):
-    """A plan without the arms; ``drafts``: of what it was taken; ``located``: the run in the plan's
-    frame; ``budgets_of``: of this or another plan of it; ``heading``: notes that come before any
-    such plan's own."""
+    """A plan without the arms; ``located``: the run in the plan's frame; ``budgets_of``: of this
+    or another plan of it; ``heading``: notes that come before any such plan's own."""
 
     plan: ResectionPlan
     drafts: Drafts
@@ -190,7 +177,7 @@ def plan_cuts(
 
 
 def check_arms_installed() -> None:
-    """Raises InputError: a library that motions need is missing."""
+    """Raises InputError."""
     needed = ("pinocchio", "coal", "toppra")
     if missing := [name for name in needed if find_spec(name) is None]:
         raise InputError(
@@ -225,3 +212,45 @@ def below(organ: Mesh, config: CellConfig) -> CellConfig:
     x, y = organ.box_mm.mean(0)[:2].tolist()
     middle_mm = (x, y, float(organ.box_mm[0, 2]) - config.stand_mm)
     return msgspec.structs.replace(config, middle_mm=middle_mm)
+
+
+def plan_resection(
+    located: str | Path | Estimate,
+    *,
+    picture: str | Path | None = None,
+    stand_mm: float | None = None,
+    accept_poor: bool = False,
+    accept_budget: bool = False,
+    **options: Any,
+) -> ResectionPlan:
+    """Where to cut a tumor out; nothing moves. `tumortrack plan` also plans the arms' motions.
+
+    Args:
+        located: a folder that `tumortrack locate` wrote, or an estimate; camera frame, mm. The
+            camera is taken to look straight down on the table.
+        picture: PNG file to draw the plan into.
+        stand_mm: height of the organ's lowest point over the table.
+        accept_poor: plan on a poor estimate; the plan's notes say so.
+        accept_budget: plan though the margin does not cover the errors that are to be expected
+            (docs/resection.md); the plan's notes say so.
+        options: fields of ``ResectionConfig``: ``tumor``, ``method`` (``margin`` or
+            ``published``), ``margin_mm`` and others.
+
+    Returns:
+        The plan: cuts, layers, grasp point; table frame, mm, z up.
+
+    Raises:
+        NoPlan: nothing to cut, or not as asked, or the margin is less than the errors; says why.
+        InputError: a poor estimate; no such tumor, or an option that is not allowed.
+    """
+    config = from_builtins(options, ResectionConfig, "plan_resection")
+    run = of_estimate(located) if isinstance(located, Estimate) else read_run(Path(located))
+    stand_mm = STAND_MM if stand_mm is None else stand_mm
+    frames = PublishedFrame("table", table_under(run.meshes, stand_mm))
+    cuts = plan_cuts(run, config, frames, accept_poor)
+    plan = checked_against(cuts.plan, cuts.budgets_of(cuts.plan), accept_budget)
+    if picture is not None:
+        from tumortrack_resection.pictures import draw_plan
+
+        draw_plan(plan, cuts.located, Path(picture))
+    return plan

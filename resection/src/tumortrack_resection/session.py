@@ -39,18 +39,16 @@ from tumortrack.live.values import (
     Source,
     SourceConfig,
     TrackingResult,
-    Workcell,
 )
 from tumortrack.live.workers import SinkWorker
 from tumortrack.models.folder import patient_of
 from tumortrack.tracking.options import CameraOptions, model_folder, options_from
 from tumortrack_devices.sources.virtual import VirtualSourceConfig
 from tumortrack_devices.viewer.scene import bare_faces
-from tumortrack_resection.budget import tightest
-from tumortrack_resection.checking import checked
+from tumortrack_resection.budget import LiveBudget, tightest
+from tumortrack_resection.check import checked
 from tumortrack_resection.files import INVENTED, PlanFolder, read_plan
 from tumortrack_resection.grip import Grip, held_std_mm
-from tumortrack_resection.live_budget import LiveBudget
 from tumortrack_resection.located import of_estimate
 from tumortrack_resection.motions import Joints, Motions
 from tumortrack_resection.operation import (
@@ -68,11 +66,9 @@ from tumortrack_resection.values import POOR_ESTIMATE, Located, ResectionPlan
 if TYPE_CHECKING:
     from tumortrack_resection.arms.cell import ArmCell
     from tumortrack_resection.arms.config import CellConfig
-    from tumortrack_resection.film import Reel
 
 _FPS = 30.0  # of a playback
 _PLAYBACK = "PLAYBACK of a stored plan: nothing is tracked"
-_FILM_FRAMES, _FILM_STEP_S = 120, 0.1
 _LIVE_SOURCES = ("realsense", "ros2")  # that show the present
 
 
@@ -107,16 +103,9 @@ class _Pulled(SourceConfig, frozen=True, kw_only=True, tag="pulled"):
 
 class ResectionSession:
     """A stored plan with everything that carrying it out needs; made by ``begin_resection``,
-    which has checked it. ``following`` carries it out once, ``opened`` and ``play`` play it back.
-
-    Attributes:
-        stored: the plan's folder.
-        motions: of both arms; ``seconds`` is how long they take at the chosen speed.
-        arms: the sinks of real arms; those that execute are ``moving``, the others ``dry``.
-        operation: the controller of the arms.
-        sinks: of a playback.
-        reel: set one before ``following`` for ``film_of_run``.
-    """
+    which has checked it. ``following`` carries it out once, ``opened`` and ``play`` play it
+    back. ``arms``: the sinks of real arms; those that execute are ``moving``, the others
+    ``dry``. ``sinks``: of a playback."""
 
     def __init__(
         self, stored: PlanFolder, motions: Motions, cell: ArmCell, live: _Live | None,
@@ -131,12 +120,11 @@ class ResectionSession:
         self.sinks: list[SinkWorker] = []
         self.operation = self._operation(stored.plan, config)
         self._confirmed = False
-        self.reel: Reel | None = None
 
     def confirm(self) -> None:
         """A person at the terminal types the address of each arm that will move; valid for one
-        ``following``, which asks by itself otherwise. No argument replaces this, so that no script
-        moves an arm unattended. InputError: something else is typed."""
+        ``following``, which asks by itself otherwise. No argument replaces this, so that no
+        script moves an arm unattended. InputError: something else is typed."""
         for arm in self.moving:
             import termios  # not on Windows, where no terminal would be found before
 
@@ -158,11 +146,10 @@ class ResectionSession:
     @contextmanager
     def following(self) -> Iterator[Session]:
         """A live session that compares every estimate with the plan, and replans where the tumor
-        has moved. InputError: no ``live`` source was given. ``reel``, if it is one, gets all."""
+        has moved. InputError: no ``live`` source was given."""
         from tumortrack_resection.arms import procedure
         from tumortrack_resection.arms.body import cell_urdf
-        from tumortrack_resection.arms.cell import tip_places
-        from tumortrack_resection.arms.reach import ArmsReach
+        from tumortrack_resection.arms.cell import ArmsReach, tip_places
 
         stored, live, cell, frames = self.stored, self._live, self._cell, self.stored.frames
         if live is None:
@@ -210,13 +197,12 @@ class ResectionSession:
             arms = Arms(self.operation, setup, about, tip_places(cell.config), bool(self.arms))
             names = ("report", *(field.name for field in fields(CameraOptions)))
             options = {name: getattr(self._options, name) for name in names}
-            sinks = self._given_sinks if self.reel is None else (*self._given_sinks, self.reel)
-            yield api.session(live.model, live.source_text, sinks, arms, **options)
+            yield api.session(live.model, live.source_text, self._given_sinks, arms, **options)
 
     @contextmanager
     def opened(self) -> Iterator[None]:
-        """For a playback: sinks at work; the report is written when they have flushed. Raises as
-        ``open_sinks``; InputError: real arms would move, which need the live loop."""
+        """For a playback: sinks at work; the report is written when they have flushed.
+        InputError: real arms would move, which need the live loop."""
         if self.moving:
             raise InputError("real arms move only beside the live loop, not in a playback.")
         stored, operation, report = self.stored, self.operation, self._options.report
@@ -241,8 +227,8 @@ class ResectionSession:
             store.write_json(report, content)
 
     def play(self, on_result: Callable[[TrackingResult], None]) -> None:
-        """Play the stored motions back in real time, without a camera, while ``opened``.
-        ``on_result`` is called with every result, after the sinks have got it."""
+        """The stored motions in real time, without a camera, while ``opened``. ``on_result`` is
+        called with every result, after the sinks have got it."""
         frames, started_s = self.stored.frames, time.monotonic()
         for sequence in itertools.count():
             if self._controls.aborted.is_set():
@@ -263,52 +249,12 @@ class ResectionSession:
         self.operation.abort(Halt("interrupted"))
 
     def film(self, path: Path, progress: Callable[[int, int], None] = lambda n, of: None) -> float:
-        """Write the stored plan as an animated GIF of about twelve seconds; returns its length in
-        s. ``progress``: called with the frames drawn, and of how many. Raises as ``film.film``."""
-        from tumortrack_resection.film import FPS, film, moments_s
+        """Write the stored plan as an animated GIF, see ``film.film``; returns its length in s.
+        ``progress``: called with the frames drawn, and of how many."""
+        from tumortrack_resection.film import film
 
-        times_s, plan = moments_s(self.motions, _FILM_FRAMES), self.stored.plan
-        without_notes = replace(plan, notes=())  # the film shows them itself
-        operation = self._operation(without_notes, OperationConfig())
-        result = TrackingResult(0, 0, reason=_PLAYBACK)
-
-        def frames() -> Iterator[Workcell]:
-            now_s = 0.0
-            for time_s in times_s.tolist():
-                cell = operation.act(result, now_s).workcell
-                while now_s < time_s:  # in steps: after a longer pause the arms would halt
-                    now_s = min(now_s + _FILM_STEP_S, time_s)
-                    cell = operation.act(result, now_s).workcell
-                assert cell is not None
-                yield cell
-
-        count = itertools.count(1)
-
-        def advance() -> None:
-            progress(next(count), len(times_s))
-
-        film(frames(), self.stored.located, path, progress=advance, plan=plan)
-        return len(times_s) / FPS
-
-    def film_of_run(
-        self, path: Path, progress: Callable[[int, int], None] = lambda n, of: None
-    ) -> float:
-        """What ``reel`` kept of the live run, as ``film``; the organ where it was tracked."""
-        from tumortrack_resection.film import FPS, Tracked, film
-
-        assert self.reel is not None
-        assert self._live is not None
-        cells, seen = self.reel.frames(_FILM_FRAMES)
-        arms = "arms moved" if self.moving else "arms SIMULATED"
-        title = f"A RUN of resect, organ tracked ({self._live.source_kind}), {arms}"
-        plan = replace(self.operation.planned.plan, notes=self.stored.plan.notes)
-        located = replace(self.stored.located, meshes=dict(self.operation.planned.meshes))
-        count = itertools.count(1)
-        film(
-            cells, located, path, progress=lambda: progress(next(count), len(cells)),
-            plan=plan, tracked=Tracked(title, seen),
-        )  # fmt: skip
-        return len(cells) / FPS
+        plan, located = self.stored.plan, self.stored.located
+        return film(plan, located, self.motions, self._cell.shapes, path, progress)
 
     def _operation(
         self, plan: ResectionPlan, config: OperationConfig, *live: Following
@@ -434,9 +380,8 @@ def _check_real(
 def _checked(
     path: Path, motions: Motions, cell: CellConfig, stored: PlanFolder
 ) -> tuple[ArmCell, PlanFolder]:
-    """The workcell, and the plan with the distances that were found now. Raises ArtifactError: the
-    motions hit something in it, or a tool comes nearer to a tumor than it may, so they are not
-    those planned."""
+    """The workcell, and the plan with the distances that were found now. Raises ArtifactError:
+    the motions hit something in it, or a tool comes nearer to a tumor than it may."""
     from tumortrack_resection.arms.body import cell_urdf
     from tumortrack_resection.arms.cell import ArmCell
     from tumortrack_resection.arms.trajectory import first_hit

@@ -59,11 +59,8 @@ class Sections:
 
 
 class Facet:
-    """One facet of a piece and how it can be cut.
-
-    ``section``: of the organ within the piece's other planes, in the facet's plane, mm along
-    ``axes`` (2, 3).
-    """
+    """How one facet can be cut. ``section``: of the organ within the piece's other planes, in
+    the facet's plane, mm along ``axes`` (2, 3)."""
 
     def __init__(self, sections: Sections, planes: Planes, number: int) -> None:
         self.number = number  # of its sweep, from 1
@@ -80,12 +77,10 @@ class Facet:
 
     @property
     def _room(self) -> Float64[np.ndarray, " k"]:
-        """Offsets of the other planes within this one."""
         return self._rest[:, 3] - self._offset * (self._rest[:, :3] @ self.normal)
 
     @property
     def empty(self) -> bool:
-        """The plane cuts nothing."""
         return bool(self.section.area < _LEAST_MM2)
 
     def directions(self, lowest: float = -1.0) -> list[Vector]:
@@ -141,8 +136,7 @@ class Facet:
 
 
 def _within(path: np.ndarray, beyond: np.ndarray) -> np.ndarray:
-    """From the first to the last place where ``beyond`` is 0: beside the organ the tip is out of it
-    long before."""
+    """From the first to the last place where ``beyond`` is 0."""
     first, last = np.flatnonzero(beyond <= 0)[[0, -1]]
     ends = []
     for inner, outer in ((first, first - 1), (last, last + 1)):
@@ -186,8 +180,7 @@ def trimmed(solid: Any, planes: Planes, inward_mm: float) -> Any:
 
 
 def cup_direction(planes: Planes) -> Vector | None:
-    """From where the cup comes, and the piece is lifted to: as steeply from above as the piece
-    comes free. None: from nowhere above."""
+    """As steeply from above as the piece comes free. None: from nowhere above."""
     directions = np.concatenate([[UP], sphere(_DIRECTIONS, 0.0)])
     free = (directions @ planes[:, :3].T).max(1) <= -_CUP_SLOPE
     if not free.any():
@@ -198,9 +191,8 @@ def cup_direction(planes: Planes) -> Vector | None:
 def grasp_point(
     located: Located, label: int, piece: Piece, tools: Tools, back: Vector
 ) -> Vector | None:
-    """Where the cup, which comes from ``back``, lands on the piece: on a part of it that lies free
-    on that side, near to the tumor's centre, not steep, and away from what stays. None: there is
-    no such place."""
+    """Where the cup, which comes from ``back``, lands: on a part of the piece that lies free on
+    that side, near to the tumor's centre, not steep, and away from what stays. None: nowhere."""
     turn = np.stack([*across(back), back])  # into a frame in which the cup comes from above
     heights, low = _highest(located.organ.spread_mm(_COLUMN_MM) @ turn.T)
     slopes = np.hypot(*np.gradient(heights, _COLUMN_MM))
@@ -222,8 +214,7 @@ def grasp_point(
 def _highest(
     points_mm: Float64[np.ndarray, "n 3"],
 ) -> tuple[Float64[np.ndarray, "i j"], Float64[np.ndarray, " 2"]]:
-    """The highest z over a grid of x and y, mm, NaN where there is none; and the middle of the
-    first cell."""
+    """The highest z over a grid of x and y, NaN: none; and the middle of the first cell."""
     low = points_mm[:, :2].min(0) - _COLUMN_MM
     cell = np.round((points_mm[:, :2] - low) / _COLUMN_MM).astype(int)
     highest = np.full(tuple(cell.max(0) + 2), -np.inf)

@@ -1,9 +1,6 @@
-"""A real arm of Universal Robots: ``ur:192.168.1.10?arm=cutter&execute=false``.
-
-By default nothing is connected: each joint target is checked and counted. With ``execute=true`` the
-arm moves. The checks here are no safety system: that is in the arm's own controller, whose limits
-and planes must be set for this use.
-"""
+"""A real arm of Universal Robots: ``ur:192.168.1.10?arm=cutter&execute=false``. By default
+nothing is connected: each target is checked and counted. The checks here are no safety system:
+that is in the arm's own controller, whose limits and planes must be set for this use."""
 
 from __future__ import annotations
 
@@ -112,10 +109,8 @@ class UrSink:
     stop, meets no force, and is where the targets have led it; if not, all arms stop for good.
 
     From a standstill it begins only if the arm is within 2 degrees of the target, which it then
-    reaches within a second. On a cut, where 2 degrees are centimetres, the tool's tip must be
-    within 2 mm of its target. If this process dies, the arm's controller stops the arm within 0.2 s
-    (setWatchdog).
-    """
+    reaches within a second. On a cut the tool's tip must be within 2 mm of its target. If this
+    process dies, the arm's controller stops the arm within 0.2 s (setWatchdog)."""
 
     def __init__(self, config: UrSinkConfig, link: UrLink | None, context: SinkContext) -> None:
         self._config, self._link = config, link
@@ -137,8 +132,7 @@ class UrSink:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Results by outcome: sent (in a dry run: would send), halted, no arms, refused; and
-        silences."""
+        """Results by outcome, and silences."""
         with self._lock:
             return dict(self._counts)
 
@@ -162,7 +156,6 @@ class UrSink:
                     self._send(_target(cell.joints_rad, self._names), result.stamp_ns)
 
     def close(self) -> None:
-        """Stop the arm and disconnect."""
         if self._closed.is_set():
             return
         self._closed.set()
@@ -281,7 +274,7 @@ def _target(joints_rad: Mapping[str, float], names: tuple[str, ...]) -> Joints:
 
 
 def _check_step(step: Joints, seconds: float, jump_deg: float) -> None:
-    """Raises TumortrackError for a step too large, or too fast."""
+    """Raises TumortrackError: too large, or too fast."""
     jump, speed = np.degrees(np.abs(step)), np.abs(step) / seconds / SPEED_RAD_S
     if jump.max() > jump_deg:
         joint = int(jump.argmax())
@@ -363,7 +356,6 @@ class UrLink:
             raise TumortrackError("the arm did not take the order to stop")
 
     def kick(self) -> None:
-        """Reset the controller's watchdog."""
         self._control.kickWatchdog()
 
     def close(self) -> None:

@@ -1,8 +1,6 @@
-"""Both arms as ``cell.urdf`` has them: forward kinematics, and the solids of their tools.
-
-Read from the text alone, with nothing of the planner's that wrote it: who checks motions by it
-depends on no mistake of that. Lengths in mm.
-"""
+"""Both arms as ``cell.urdf`` has them: kinematics, and the solids of their tools. Read from the
+text alone: who checks motions by it depends on no mistake of the planner that wrote it. Lengths
+in mm."""
 
 from __future__ import annotations
 
@@ -37,11 +35,9 @@ class ToolSolid:
 
 
 class UrdfCell:
-    """Both arms' joints, and the ``solids`` of their tools; root is ``table``.
-
-    ``reach_mm``: no end of a solid is farther from the table's origin or from the holder's tip.
-    ArtifactError: the text is no URDF, or of other joints or tools.
-    """
+    """Both arms' joints, and the ``solids`` of their tools. ``reach_mm``: no end of a solid is
+    farther from the table's origin or from the holder's tip. ArtifactError: the text is no URDF,
+    or of other joints or tools."""
 
     def __init__(self, text: str) -> None:
         try:

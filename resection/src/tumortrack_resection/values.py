@@ -1,8 +1,5 @@
-"""The values of planning: configuration, located organ, cuts, the piece that comes away.
-
-All in the ``table`` frame, mm: z up against gravity, its origin on the table's top. The paper's
-'transverse plane' is the table's plane, its 'superior' is up and its 'posterior' is down.
-"""
+"""The values of planning, in the ``table`` frame, mm: z up against gravity, its origin on the
+table's top. The paper's 'transverse plane' is the table's plane, its 'superior' is up."""
 
 from __future__ import annotations
 
@@ -40,8 +37,7 @@ class ResectionConfig(Config, frozen=True, kw_only=True):
     """How to cut a tumor out.
 
     Attributes:
-        method: published: the paper's two sweeps round the tumor's projection; margin: plane facets
-            in which the electrode lies, so that its whole length keeps the margin.
+        method: published: the paper's two sweeps; margin: plane facets in which the electrode lies.
         tumor: its part's name (tumor_1, ...); empty: the one that lies farthest out.
         margin_mm: least distance between tumor and electrode (the paper's 5).
         spacing_mm: between points of a stroke.
@@ -49,8 +45,7 @@ class ResectionConfig(Config, frozen=True, kw_only=True):
         most_facets: of the piece; more follow the tumor more closely, and take longer.
         least_exophytic: a tumor with a smaller share outside the organ's hull lies wholly inside.
         most_healthy: the largest share of the organ's healthy tissue that a plan may take.
-        keep_away: structures and other tumors, with the least distance of the electrode in mm;
-            other tumors that are not named keep ``margin_mm``.
+        keep_away: structures and tumors, with distances in mm; other tumors keep ``margin_mm``.
     """
 
     method: Method = "margin"
@@ -65,9 +60,8 @@ class ResectionConfig(Config, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         self.check_between("plan:", margin_mm=MARGIN_MM, spacing_mm=(0.2, 2), lead_mm=(0, 30))
-        self.check_between(
-            "plan:", most_facets=(1, 12), least_exophytic=(0, 1), most_healthy=(0, 1)
-        )
+        shares = {"least_exophytic": (0, 1), "most_healthy": (0, 1)}
+        self.check_between("plan:", most_facets=(1, 12), **shares)
         if not all(0 < mm <= 50 for mm in self.keep_away.values()):
             raise InputError(f"plan: keep_away is {self.keep_away}; allowed: above 0 to 50 mm.")
 
@@ -93,13 +87,9 @@ def organ_surface(meshes: Mapping[str, Mesh]) -> Mesh:
 class Located:
     """Organ and tumors as located, mm; table frame, or before they are ``moved`` the camera's.
 
-    Attributes:
-        points_mm, labels: the labelled cloud: label 1 organ without tumors, 2, 3, ... tumors.
-        meshes: closed surfaces: the organ's name (tumors included), tumor_1, ...
-        bounds_mm: how far off a tumor is at most (95 %); left out where the estimate knows none.
-        structures: further surfaces that move with the organ, closed or open.
-        doubt: why the estimate is poor; empty: it is good.
-        weak: what weakens the case.
+    ``labels``: 1 organ without tumors, 2, 3, ... tumors. ``meshes``: closed; the organ's includes
+    the tumors. ``bounds_mm``: how far off a tumor is at most (95 %), where known. ``structures``:
+    closed or open. ``doubt``: why the estimate is poor. ``weak``: what weakens the case.
     """
 
     points_mm: Float[np.ndarray, "n 3"]
@@ -113,7 +103,6 @@ class Located:
     weak: tuple[Finding, ...] = ()
 
     def moved(self, b_from_a: Float[np.ndarray, "4 4"]) -> Located:
-        """The same in another frame."""
         points_mm = transform_points(b_from_a, self.points_mm)
         meshes, structures = (
             {name: mesh.moved(transform_points(b_from_a, mesh.vertices_mm)) for name, mesh in of}
@@ -130,8 +119,18 @@ class Located:
         return organ_surface(self.meshes)
 
     @property
+    def surfaces(self) -> dict[str, Mesh]:
+        """Of all parts and structures."""
+        return {**self.meshes, **self.structures}
+
+    @property
+    def parenchyma_ml(self) -> float:
+        tumors = (self.meshes[name_of(n)].volume_ml for n in self.tumors)
+        return self.organ.volume_ml - sum(tumors)
+
+    @property
     def tumors(self) -> tuple[int, ...]:
-        """Labels of the located tumors: those with points or a surface."""
+        """Labels of those with points or a surface."""
         counts = np.bincount(self.labels, minlength=np.iinfo(np.uint8).max + 1)
         named = range(FIRST_TUMOR, len(counts))
         return tuple(n for n in named if counts[n] or name_of(n) in self.meshes)
@@ -139,12 +138,9 @@ class Located:
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """One pass of the instrument.
-
-    ``sweep``: the one it belongs to, from 1. ``path_mm``: of the electrode's tip, in the order of
-    motion; of a closed stroke the first point is repeated at the end. ``axis``: unit vector from
-    the pencil to the tip, the same all along; None: level, in directions that the arms choose.
-    """
+    """One pass of the instrument. ``path_mm``: of the electrode's tip, in the order of motion.
+    ``axis``: unit vector from the pencil to the tip; None: level, in directions that the arms
+    choose."""
 
     sweep: int
     path_mm: Float64[np.ndarray, "_ 3"]
@@ -161,16 +157,10 @@ class Cut:
 
 @dataclass(frozen=True)
 class Clearance:
-    """The least distance, over all motions, of one solid of a tool to one surface.
-
-    Attributes:
-        solid: electrode (its bare length, energised or not), pencil, rod or cup.
-        part: tumor_1, ..., or a structure.
-        least_mm: between the surfaces; negative: the solid's axis goes so deep into the part.
-        energised_mm: the same while the electrode cuts; None: never, or another solid.
-        stage, at_s: of the motions, and seconds after it began, where ``least_mm`` is reached.
-        place_mm: the place on the part's surface that is nearest then; table frame.
-    """
+    """The least distance, over all motions, of one solid of a tool to one surface: ``least_mm``
+    (negative: the solid's axis goes so deep into the part), reached ``at_s`` after ``stage``
+    began, at the nearest place of the part's surface. ``energised_mm``: the same while the
+    electrode cuts; None: never, or another solid."""
 
     solid: str
     part: str
@@ -186,24 +176,18 @@ class ResectionPlan:
     """Where to grasp and to cut, and what comes away if the estimate is right.
 
     Attributes:
-        tumor: its part's name (tumor_1, ...) and ``label``.
         grasp_mm: where the grasper's cup touches.
         cuts: passes in their order.
         piece: what comes away, closed; without what the electrode's width takes.
         taken: names of the tumors that come away, the planned one among them.
         keep_mm: what the electrode keeps away from beside them, with distances.
-        facets: of the method ``margin`` (k, 4), one a sweep: outward unit normals n and offsets h,
-            mm. The electrode's axis stays in the planes n x = h; the piece lies on their inner
-            sides. Empty: another method.
+        facets: of the method ``margin``, one a sweep: outward unit normals n and offsets h, mm. The
+            electrode's axis stays in n x = h; the piece lies on the inner sides.
         lift: unit vector along which the piece is lifted out, and from where the cup comes.
-        margin_mm: the requested least distance between tumor and electrode.
-        volumes_ml: organ, parenchyma (of that, no tumor), tumor, piece (all that comes away),
-            healthy (of that, parenchyma); with facets kerf (parenchyma within the electrode's
-            width).
+        volumes_ml: organ, parenchyma (of that, no tumor), tumor, piece, healthy (of the piece,
+            parenchyma); with facets kerf (parenchyma within the electrode's width).
         exophytic: share of the tumor outside the organ's hull.
-        notes: what the user should know.
-        clearances: what the check of the finished motions found (``check``); empty: there are no
-            motions, and the plan is unchecked.
+        clearances: what the check of the motions found; empty: there are none: unchecked.
     """
 
     method: Method

@@ -14,8 +14,8 @@ from tumortrack.imaging.raster import label_grid
 from tumortrack_lab.bench.rows import MOTIONS, PLAN, Workload
 from tumortrack_lab.bench.subject import BenchSubject
 from tumortrack_lab.twin.apparatus import moved
+from tumortrack_resection.drafts import plan_resection
 from tumortrack_resection.located import STAND_MM
-from tumortrack_resection.resection import plan_resection
 from tumortrack_resection.values import Located, ResectionConfig
 
 _POINTS = 40_000
@@ -34,7 +34,7 @@ def workloads(subject: BenchSubject, _: float) -> Iterator[Workload]:
     from tumortrack_resection.arms.body import cell_urdf
     from tumortrack_resection.arms.config import CellConfig
     from tumortrack_resection.arms.procedure import plan_motions
-    from tumortrack_resection.checking import checked
+    from tumortrack_resection.check import checked
     from tumortrack_resection.planning import below
 
     cell = below(located.organ, CellConfig())

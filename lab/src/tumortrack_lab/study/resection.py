@@ -39,8 +39,8 @@ from tumortrack_lab.study.tables import NOTHING, ordered
 from tumortrack_lab.study.tumor_sites import tumor_sites_of
 from tumortrack_lab.twin.apparatus import moved
 from tumortrack_resection.budget import planned_budgets
+from tumortrack_resection.drafts import plan_resection
 from tumortrack_resection.located import of_estimate
-from tumortrack_resection.resection import plan_resection
 from tumortrack_resection.values import MARGIN_MM, Located, ResectionConfig, ResectionPlan
 
 TRUTH = "truth"

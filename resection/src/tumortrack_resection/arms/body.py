@@ -1,10 +1,6 @@
-"""Arms, tools and surroundings as simple solids on links: as URDF, and as surfaces for display.
-
-One list serves collision checking (plain solids that enclose), URDF and display. Link frames are
-those of the URDF: z along the link's own joint, before its Denavit-Hartenberg transform, which
-becomes the origin of the joint that follows it. Sizes and lateral offsets are ours, rounded up from
-the maker's drawings.
-"""
+"""Arms, tools and surroundings as simple solids on links, one list for collisions (plain solids
+that enclose), URDF and display. Sizes and lateral offsets are ours, rounded up from the maker's
+drawings."""
 
 from __future__ import annotations
 
@@ -44,15 +40,8 @@ TABLE, STAND, CAMERA, PEDESTAL = "table", "stand", "camera", "pedestal"
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One solid on a link.
-
-    Attributes:
-        name: within its link's arm: ``forearm``, ``electrode``.
-        link: the URDF's link.
-        kind, size_mm: box (x, y, z), cylinder (radius, length; its axis along z), ball (radius).
-        link_from_part: mm.
-        use: what it is for: collisions, pictures, or both.
-    """
+    """One solid. ``size_mm``: of a box x, y, z; of a cylinder along z radius, length; of a ball
+    its radius. ``use``: for collisions, pictures, or both."""
 
     name: str
     link: str
@@ -64,7 +53,7 @@ class Part:
 
     @property
     def name_in_cell(self) -> str:
-        """Its name within the cell: ``cutter/forearm``, ``table``."""
+        """``cutter/forearm``, ``table``."""
         return self.name if self.link == TABLE else f"{self.link.split('_')[0]}/{self.name}"
 
 
@@ -151,8 +140,7 @@ def _tool_parts(config: CellConfig) -> list[Part]:
 
 
 def _surroundings(config: CellConfig) -> list[Part]:
-    """Table, the organ's post, pedestals of arms above the table, and a camera that is an obstacle,
-    in the table frame."""
+    """Table, the organ's post, pedestals, and a camera that is an obstacle."""
     middle, (x, y, top) = np.array(config.middle_mm), config.middle_mm
     slab = rigid(np.eye(3), middle - [0.0, 0.0, 20.0])
     post = ((x, y, top), (x, y, top + config.stand_mm - STAND_GAP_MM))
@@ -185,7 +173,6 @@ def display_surfaces(config: CellConfig) -> list[tuple[Part, Mesh]]:
 
 
 def _surface(part: Part) -> Mesh:
-    """A ball, a box, or a cylinder with its rims rounded off."""
     from trimesh import creation
 
     if part.kind == "ball":
@@ -194,23 +181,14 @@ def _surface(part: Part) -> Mesh:
         solid = creation.box(part.size_mm)
     else:
         radius, length = part.size_mm
-        round_mm = min(0.25 * radius, 0.25 * length, 12.0)
-        angle = np.linspace(0, np.pi / 2, 5)
-        sin, cos = round_mm * np.sin(angle), round_mm * np.cos(angle)
-        lower = np.stack([radius - round_mm + sin, round_mm - cos - length / 2], 1)
-        upper = np.stack([radius - round_mm + cos, length / 2 - round_mm + sin], 1)
-        outline = np.concatenate([[[0.0, -length / 2]], lower, upper, [[0.0, length / 2]]])
-        solid = creation.revolve(outline, sections=_SIDES)
+        solid = creation.cylinder(radius, length, sections=_SIDES)
     return Mesh(transform_points(part.link_from_part, np.array(solid.vertices)), solid.faces)
 
 
 def cell_urdf(config: CellConfig) -> str:
-    """Table, stand, camera and both arms with their tools, of primitive shapes only; the root is
-    ``table``.
-
-    Joints that move are named as in ``plan.motions.JOINTS``; ``cutter_tip`` and ``holder_tip`` are
-    the tips' frames. Lengths in metres, as URDF wants them.
-    """
+    """All links and joints, of primitive shapes only; the root is ``table``. Joints that move
+    are named as in ``motions.JOINTS``; ``cutter_tip`` and ``holder_tip`` are the tips' frames.
+    Lengths in metres, as URDF wants them."""
     robot = ET.Element("robot", name="tumortrack_cell")
     ET.SubElement(robot, "link", name=TABLE)
     for arm in ARMS:

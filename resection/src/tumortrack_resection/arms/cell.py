@@ -17,10 +17,16 @@ from jaxtyping import Float64
 from tumortrack.core.errors import NoPlan
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import RigidShape
+from tumortrack.registration.advice import Place
 from tumortrack_resection.arms import body
 from tumortrack_resection.arms.config import CellConfig
-from tumortrack_resection.arms.inverse_kinematics import inverse_kinematics
-from tumortrack_resection.arms.kinematics import ArmModel, Pose, nearest_turn
+from tumortrack_resection.arms.kinematics import (
+    ArmModel,
+    Pose,
+    inverse_kinematics,
+    level_pose,
+    nearest_turn,
+)
 from tumortrack_resection.motions import ARMS, CUTTER, HOLDER, Joints
 
 ORGAN = "organ"
@@ -29,15 +35,14 @@ TOUCHES = {CUTTER: "cutter/electrode", HOLDER: "holder/cup"}  # what of a tool m
 CollidingPair = tuple[str, str]
 _THICK_MM = 10.0  # of what a tool is made of, about its own axis
 _MOST_ROOM_MM = 64.0  # asked for beyond all clearances: parts of an arm are no farther apart
+_FACING = 0.5  # cosine from a tool's way back to the surface's normal: a flatter tip slides off
+_YAWS = 8  # directions from which the electrode comes; the cup always comes from above
 
 
 class ArmCell:
-    """Both arms with their tools over the table, and the organ once it is known.
-
-    Values do not change after construction, but the buffers of pinocchio do: one thread at a time.
-    ``model`` and ``solids`` are pinocchio's, in metres. ``keep``: surfaces from which the electrode
-    keeps a distance, mm, whatever it does.
-    """
+    """Both arms with their tools over the table, and the organ once it is known. pinocchio's
+    buffers change with every call: one thread at a time. ``keep``: surfaces from which the
+    electrode keeps a distance, mm, whatever it does."""
 
     def __init__(
         self,
@@ -88,8 +93,7 @@ class ArmCell:
         return np.array(levers)
 
     def tips(self, joints_rad: Joints) -> dict[str, Pose]:
-        """``table_from_tip`` (mm) of ``cutter`` and ``holder``: z up; the instrument points along
-        its x."""
+        """``table_from_tip`` (mm) of both arms: z up; the instrument points along its x."""
         places = self._frames(joints_rad, [f"{arm}_tip" for arm in ARMS])
         return dict(zip(ARMS, places.values(), strict=True))
 
@@ -98,8 +102,7 @@ class ArmCell:
         return body.display_surfaces(self.config)
 
     def shapes(self, joints_rad: Joints) -> tuple[RigidShape, ...]:
-        """Everything but the organ as surfaces in the table frame, and a bead at each tip
-        (``cutter/tip``)."""
+        """Everything but the organ in the table frame, and a bead at each tip."""
         places = self._frames(joints_rad, {part.link for part, _ in self._surfaces})
         return tuple(
             RigidShape(part.name_in_cell, mesh, places[part.link], part.colour)
@@ -122,13 +125,9 @@ class ArmCell:
         moving: str | None = None,
         room_mm: float = 0.0,
     ) -> CollidingPair | None:
-        """Names of the first pair that comes nearer than its clearance, or None.
-
-        Args:
-            touching: arms whose electrode or cup may touch the organ.
-            moving: the moving arm, if the rest is known to be free; None: test everything.
-            room_mm: beyond all clearances, rounded up.
-        """
+        """The first pair that comes nearer than its clearance. ``touching``: arms whose
+        electrode or cup may touch the organ; ``moving``: the arm that does, if the rest is known
+        to be free; ``room_mm``: beyond all clearances, rounded up."""
         if room_mm > 0:
             room_mm = 2.0 ** np.ceil(np.log2(room_mm))  # few, as each has buffers of its own
         state = self._state(tuple(sorted(touching)), moving, room_mm)
@@ -180,8 +179,8 @@ def tip_places(
 
 
 class Blocked(NoPlan):
-    """This motion is impossible, another may not be. The text says where and why; ``pair``: what
-    would collide, if that is the reason."""
+    """This motion is impossible, another may not be; ``pair``: what would collide, if that is
+    why."""
 
     def __init__(self, text: str, pair: CollidingPair | None = None) -> None:
         super().__init__(text)
@@ -194,13 +193,8 @@ class Blocked(NoPlan):
 
 @dataclass(frozen=True, eq=False)
 class PlanningGroup:
-    """The joints that move while the others stand still.
-
-    Attributes:
-        arm: cutter or holder.
-        joints_rad: where both are (12,).
-        touching: arms that may touch the organ with their electrode or cup.
-    """
+    """One arm's joints, which move while the others stand still at ``joints_rad`` (12).
+    ``touching``: arms that may touch the organ with their electrode or cup."""
 
     cell: ArmCell
     arm: str
@@ -209,13 +203,11 @@ class PlanningGroup:
 
     @cached_property
     def own(self) -> slice:
-        """The moving joints among the twelve."""
         first = 6 * ARMS.index(self.arm)
         return slice(first, first + 6)
 
     @property
     def current_rad(self) -> Float64[np.ndarray, " d"]:
-        """The moving joints now."""
         return self.joints_rad[self.own]
 
     @property
@@ -224,18 +216,15 @@ class PlanningGroup:
 
     @property
     def model(self) -> ArmModel:
-        """The type of the moving arm."""
         return self.cell.config.model(self.arm)
 
     def all_joints(self, own_rad: Float64[np.ndarray, " d"]) -> Joints:
-        """All twelve joints, the moving ones being these."""
         joints = self.joints_rad.copy()
         joints[self.own] = own_rad
         return joints
 
     def inverse_kinematics(self, table_from_tip: Pose) -> Float64[np.ndarray, "k 6"]:
-        """All branches that bring the moving arm's tip to a pose, regardless of collisions, each
-        joint turned near its present angle."""
+        """All branches that bring the tip to a pose, each joint turned near its present angle."""
         base_from_table, tip_from_flange = self._frames
         flange = base_from_table @ table_from_tip @ tip_from_flange
         return nearest_turn(self.model, inverse_kinematics(self.model, flange), self.current_rad)
@@ -243,9 +232,9 @@ class PlanningGroup:
     @cached_property
     def _frames(self) -> tuple[Pose, Pose]:
         """``base_from_table`` and ``tip_from_flange``, mm."""
-        config, arm = self.cell.config, self.arm
-        poses = config.base(arm).table_from_base, config.flange_from_tip(arm)
-        return np.linalg.inv(poses[0]), np.linalg.inv(poses[1])
+        config = self.cell.config
+        base, flange = config.base(self.arm).table_from_base, config.flange_from_tip(self.arm)
+        return np.linalg.inv(base), np.linalg.inv(flange)
 
     def collides(
         self, own_rad: Float64[np.ndarray, " d"], room_mm: float = 0.0
@@ -256,11 +245,9 @@ class PlanningGroup:
     def segment_collides(
         self, start_rad: np.ndarray, goal_rad: np.ndarray, spacing: float = 1.0
     ) -> CollidingPair | None:
-        """The same between two free configurations, on the straight segment in joint space.
-
-        With ``spacing`` 1 no point of an arm moves by more than twice the least clearance in one
-        step, so that what is free of collisions with that clearance at both ends is free between.
-        """
+        """The same on the straight segment in joint space between two free configurations. With
+        ``spacing`` 1 no point moves by more than twice the least clearance in one step: what is
+        free with that clearance at both ends is free between."""
         least_mm = self.cell.config.least_clearance_mm(self.touching)
         levers_mm = self.cell.levers_mm(self.all_joints(start_rad), self.all_joints(goal_rad))
         moved_mm = float(np.abs(goal_rad - start_rad) @ levers_mm[self.own])
@@ -268,31 +255,22 @@ class PlanningGroup:
         if n < 2:
             return None
         step_rad = (goal_rad - start_rad) / n
+        moved = np.full(n, moved_mm / n)
         found = blocked_between(
-            0,
-            n,
-            np.full(n, moved_mm / n),
-            lambda k, mm: self.collides(start_rad + k * step_rad, mm),
+            0, n, moved, lambda k, mm: self.collides(start_rad + k * step_rad, mm)
         )
         return None if found is None else found[1]
 
 
 def blocked_between(
-    first: int,
-    last: int,
-    moved_mm: Float64[np.ndarray, " n"],
+    first: int, last: int, moved_mm: Float64[np.ndarray, " n"],
     test: Callable[[int, float], CollidingPair | None],
-) -> tuple[int, CollidingPair] | None:
-    """The number of a pose between two others at which something comes too near, and what.
-
-    Not every pose is tested: where all keep more than their clearances by as much as anything moves
-    until another pose, that one is free, too. From the middle outward, as collisions are rarely
-    near the ends.
-
-    Args:
-        moved_mm: at most, of any point, from pose ``first`` + n to the next.
-        test: the pair that comes nearer at a pose than its clearance and some room, mm.
-    """
+) -> tuple[int, CollidingPair] | None:  # fmt: skip
+    """The number of a pose between two others at which something comes too near, and what. A
+    pose is left out where a tested one keeps so much more that nothing can move as far. From the
+    middle outward, as collisions are rarely near the ends. ``moved_mm``: at most, of any point,
+    from pose ``first`` + n to the next; ``test``: the pair that comes nearer at a pose than its
+    clearance and some room, mm."""
     way_mm = np.append(0.0, np.cumsum(moved_mm))
     open_ends = deque([(first, last)])
     while open_ends:
@@ -321,8 +299,7 @@ def _solid_names(solids: Any, parts: tuple[body.Part, ...]) -> list[str]:
 
 
 def _pairs() -> list[CollidingPair]:
-    """All pairs that could ever collide: not neighbouring links, nor parts of an arm that its
-    joints' offsets keep apart."""
+    """All that could ever collide: not neighbouring links, nor what joints' offsets keep apart."""
     moving = {arm: [f"{arm}/{name}" for name in (*body.LINKS[2:], *TOOLS[arm])] for arm in ARMS}
     pairs = list(product(moving[CUTTER], moving[HOLDER]))
     for arm, other in (ARMS, ARMS[::-1]):
@@ -345,3 +322,23 @@ def _bounding_volumes(organ: Mesh) -> Any:
     surface.addTriangles(np.array(organ.faces, dtype=np.int64))
     surface.endModel()
     return surface
+
+
+class ArmsReach:
+    """Whether one of the tips can touch the organ (``organ``: its surface, table frame) while the
+    other arm stays where it is: without a collision there. The way there is not planned."""
+
+    def __init__(self, config: CellConfig, organ: Mesh, joints_rad: Joints) -> None:
+        cell = ArmCell(config, organ)
+        self._groups = {arm: PlanningGroup(cell, arm, joints_rad, (arm,)) for arm in ARMS}
+
+    def __call__(self, place_mm: Place, normal: Place) -> bool:
+        """A place of its surface, and the outward normal there; table frame, mm."""
+        ways = [(CUTTER, yaw) for yaw in np.linspace(0, 2 * np.pi, _YAWS, endpoint=False)
+                if normal @ [-np.cos(yaw), -np.sin(yaw), 0.0] > _FACING]  # fmt: skip
+        ways += [(HOLDER, 0.0)] if normal[2] > _FACING else []
+        return any(
+            self._groups[arm].collides(branch) is None
+            for arm, yaw in ways
+            for branch in self._groups[arm].inverse_kinematics(level_pose(place_mm, yaw))
+        )

@@ -31,7 +31,7 @@ _ALLOWED: dict[str, tuple[float, float]] = {
 
 
 class Base(Config, frozen=True, kw_only=True):
-    """Where an arm stands: its base's middle in the table frame, turned about the vertical."""
+    """An arm's base in the table frame: its middle, turned about the vertical."""
 
     position_mm: tuple[float, float, float]
     yaw_deg: float
@@ -45,31 +45,22 @@ class CellConfig(Config, frozen=True, kw_only=True):
     """What stands where; table frame, mm.
 
     Attributes:
-        cutter_model, holder_model: which arm carries the instrument, which the vacuum grasper.
         cutter_base, holder_base: where they stand, on pedestals if above the table.
-        bracket_mm, pencil_mm, electrode_mm: the instrument hangs this far below the flange; its
-            grip reaches this far forward, level, and so does its bare electrode (the usual long
-            one), or by ``bend_deg`` downward: a bent tip.
-        rod_mm, cup_mm, cup_radius_mm: the grasper hangs straight down from its flange; the last
-            ``cup_mm`` are a soft cup.
+        bracket_mm, pencil_mm, electrode_mm: the instrument hangs so far below the flange; its grip
+            reaches so far ahead, and then the bare electrode, level or by ``bend_deg`` downward.
+        rod_mm, cup_mm, cup_radius_mm: the grasper hangs straight down; its end is a soft cup.
         home_rad: all twelve joints in the order of ``JOINTS``.
-        middle_mm: the middle of the table's top, straight below the organ: the origin, unless the
-            plan is in a robot's frame.
-        table_mm: the table's size along x and y.
-        stand_mm: height of the organ's lowest point above the table; ``stand_radius_mm``: of the
-            post that carries it.
-        camera_mm: middle of the camera's box over ``middle_mm``, if ``camera_is_obstacle``. By
-            default it is no obstacle: a camera that looks straight down from 150 mm is where the
-            arms work, so it is assumed to be swung away while they do.
+        middle_mm: of the table's top, straight below the organ; ``table_mm``: its size, x and y.
+        stand_mm: height of the organ's lowest point above it; ``stand_radius_mm``: of the post.
+        camera_mm: the camera's middle over ``middle_mm``, if ``camera_is_obstacle``: by default it
+            is assumed to be swung away, as the arms work where it is.
         clearance_mm: the arms' least distance from each other, themselves and all that stands;
             ``organ_clearance_mm``: from the organ, except for electrode and cup at work;
             ``contact_mm``: of the electrode from the soft cup then.
         cutting_mm_s: the tip's maximum speed on a cut and in tissue; ``grasping_mm_s``: on the
-            straight path to the grasp and back.
-        speed_share: of the maker's maximum joint speeds.
+            straight path to the grasp and back. ``speed_share``: of the maker's joint speeds.
         pull_mm: the holder rises so far once it holds, so that the tissue is taut when it is cut.
-        tool_error_mm: largest error of a tool's tip where its arm stands as planned, loads
-            included: the arms' accuracy, and what gives way. None: not known.
+        tool_error_mm: largest error of a tool's tip at its planned place, loads included.
     """
 
     cutter_model: Literal["ur10e", "ur5"] = "ur10e"
@@ -121,7 +112,6 @@ class CellConfig(Config, frozen=True, kw_only=True):
 
     @property
     def tools(self) -> Tools:
-        """What the planner has to know of them."""
         x, y, z = self.middle_mm
         # The post ends a little below the organ, which must not count as touched by its support.
         stand = (x, y, z + self.stand_mm - STAND_GAP_MM, self.stand_radius_mm)
@@ -131,7 +121,6 @@ class CellConfig(Config, frozen=True, kw_only=True):
         )  # fmt: skip
 
     def model(self, arm: str) -> ArmModel:
-        """The type of arm that is ``cutter`` or ``holder``."""
         return MODELS[self.cutter_model if arm == CUTTER else self.holder_model]
 
     @property
@@ -148,14 +137,13 @@ class CellConfig(Config, frozen=True, kw_only=True):
         return self.cutter_base if arm == CUTTER else self.holder_base
 
     def least_clearance_mm(self, touching: Collection[str]) -> float:
-        """Of any pair, where these arms may touch the organ: the tools come nearest to each other
-        where both do."""
+        """Of any pair: the tools come nearest to each other where both arms may touch the organ."""
         contact_mm = self.contact_mm if len(touching) == len(ARMS) else np.inf
         return min(self.clearance_mm, self.organ_clearance_mm, contact_mm)
 
     def flange_from_tip(self, arm: str) -> Pose:
-        """The tip's frame: the instrument points along x, and is level where z is up; that is where
-        the flange points down, or by ``bend_deg`` off it."""
+        """The instrument points along x, and is level where z is up: where the flange points
+        down, or by ``bend_deg`` off it."""
         if arm == CUTTER:
             turn = _DOWN @ Rotation.from_euler("y", self.bend_deg, degrees=True).as_matrix()
             grip_mm = np.array([self.pencil_mm, 0.0, self.bracket_mm])

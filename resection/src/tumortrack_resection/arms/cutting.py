@@ -40,9 +40,9 @@ DETOURS_MM = ((60.0, 0.0), (0.0, 70.0), (60.0, 70.0), (0.0, 140.0))
 
 
 class Outside:
-    """How far the instrument has to go straight back until its electrode is clear of the organ, and
-    all that it keeps away from (``things``, with distances in mm), and of the cup that holds it
-    (at ``grasp_mm``, coming from ``lift``)."""
+    """How far the instrument has to go straight back until its electrode is clear of the organ,
+    of all that it keeps away from (``things``, with distances in mm), and of the cup that holds
+    it (at ``grasp_mm``, coming from ``lift``)."""
 
     def __init__(
         self,
@@ -85,22 +85,20 @@ class Leg:
     def along(
         cls, path_mm: Float64[np.ndarray, "n 3"], turn: np.ndarray, back_mm: Sequence[float]
     ) -> Leg:
-        """With a straight lead-in to the first point and lead-out from the last, along the
-        instrument's axis, where it cuts nothing more; each so long. ``turn``: table from tip
-        (3, 3)."""
+        """With a straight lead-in and lead-out along the instrument's axis, where it cuts
+        nothing more; each so long. ``turn``: table from tip (3, 3)."""
         cut = poses(path_mm, turn)
         leads = [straight_back(cut[n], far) for n, far in zip((0, -1), back_mm, strict=True)]
         return cls(leads[0][::-1], cut, leads[1])
 
     @property
     def poses(self) -> Float64[np.ndarray, "m 4 4"]:
-        """Along the whole leg; corners are there once."""
         return np.concatenate([self.enter[:-1], self.cut, self.leave[1:]])
 
     @property
     def runs(self) -> list[tuple[slice, bool]]:
-        """Slices of ``poses`` without a stop, and whether they cut; each begins where the last
-        ends. At sharp corners of the cut the tip stops."""
+        """Slices of ``poses`` without a stop, and whether they cut; at sharp corners the tip
+        stops."""
         edges = np.diff(self.cut[:, :3, 3], axis=0)
         edges /= np.linalg.norm(edges, axis=1, keepdims=True)
         corners = np.flatnonzero((edges[1:] * edges[:-1]).sum(1) < _CORNER) + 1
@@ -135,7 +133,7 @@ def turns_about(axis: Float64[np.ndarray, " 3"], count: int = _ROLLS) -> list[np
 
 
 class Way(NamedTuple):
-    """One way to carry a pass out: as the arm does it, and its joints at the leg's poses."""
+    """One way to carry a pass out, and its joints at the leg's poses."""
 
     cut: Cut
     leg: Leg
@@ -144,8 +142,8 @@ class Way(NamedTuple):
 
 def ways(group: PlanningGroup, cuts: Sequence[Cut], outside: Outside) -> list[Way]:
     """How the arm can carry one of several passes out that are as good as one another: in either
-    direction of motion, turned about the electrode's axis; without the approach. Raises Blocked: it
-    can't; with the most frequent reason."""
+    direction, turned about the electrode's axis; without the approach. Raises Blocked: the most
+    frequent reason."""
     reasons: list[Blocked] = []
     found: list[Way] = []
     for cut in cuts:
@@ -164,8 +162,8 @@ def ways(group: PlanningGroup, cuts: Sequence[Cut], outside: Outside) -> list[Wa
 def _legs(
     group: PlanningGroup, cut: Cut, outside: Outside, reasons: list[Blocked]
 ) -> Iterator[tuple[Cut, Leg]]:
-    """Those whose first, middle and last pose are possible, each by itself, and from whose middle
-    the instrument can be taken straight back. Turns that are alike do not follow one another."""
+    """Those whose first, middle and last pose are possible, and from whose middle the instrument
+    can go straight back. Turns that are alike do not follow one another."""
     assert cut.axis is not None
     path_mm = resampled(cut.path_mm, _STEP_MM)
     places = path_mm[[len(path_mm) // 2, 0, -1]]
@@ -183,7 +181,7 @@ def _legs(
 
 
 def go_one_of(builder: TrajectoryBuilder, ways: Sequence[Way]) -> Cut:
-    """Approach and carry out whichever way is nearest, or can be reached at all. Raises Blocked."""
+    """Approach and carry out the nearest way, or one that can be reached at all. Raises Blocked."""
     away, reasons = builder.group(CUTTER, (HOLDER,)), list[Blocked]()
     turned: list[tuple[float, int, Way]] = []
     for way in ways:
@@ -209,8 +207,8 @@ def go_one_of(builder: TrajectoryBuilder, ways: Sequence[Way]) -> Cut:
 def free(
     group: PlanningGroup, table_from_tip: Pose, reasons: list[Blocked] | None = None
 ) -> Float64[np.ndarray, " 6"] | None:
-    """The nearest joints that bring the tip there without a collision. None: there are none, and
-    ``reasons`` has one more."""
+    """The nearest joints that bring the tip there without a collision; or None, and one more of
+    ``reasons``."""
     solutions = group.inverse_kinematics(table_from_tip)
     pair: CollidingPair | None = None
     for n in np.argsort(np.abs(solutions - group.current_rad).max(1, initial=0.0)):
@@ -222,9 +220,11 @@ def free(
 
 
 def _execute(builder: TrajectoryBuilder, way: Way, search: bool) -> None:
-    """Approach and leg. Raises Blocked; nothing is added then. ``search``: an approach by trees."""
+    """Approach (``search``: by trees) and leg. Raises Blocked; nothing is added then."""
     away = builder.group(CUTTER, (HOLDER,))
-    detours = _detours(away, way.leg.poses[0])
+    ends = builder.tip(CUTTER), way.leg.poses[0]
+    corners = [[aside(away, pose, *by) for pose in ends] for by in DETOURS_MM]
+    detours = [np.array(pair) for pair in corners if all(len(corner) for corner in pair)]
     approach = connect(away, way.joints_rad[0], builder.rng if search else None, detours)
     attempt = copy(builder)
     attempt.go(CUTTER, approach)
@@ -242,8 +242,8 @@ def _most_frequent(reasons: list[Blocked], place_mm: np.ndarray) -> Blocked:
 
 
 def cut_level(builder: TrajectoryBuilder, cut: Cut, outside: Outside) -> None:
-    """A stroke of the level instrument, in as few legs as possible: between two it leaves and comes
-    from another side. Raises Blocked: somewhere no direction is possible."""
+    """A stroke of the level instrument, in as few legs as possible, each from another side.
+    Raises Blocked: somewhere no direction is possible."""
     path_mm = resampled(cut.path_mm, _STEP_MM)
     for _ in range(_MOST_LEGS):
         path_mm = path_mm[_cut_leg(builder, cut, path_mm, outside) :]
@@ -286,13 +286,6 @@ def level_turns(count: int = _YAWS) -> list[np.ndarray]:
     """Table from tip (3, 3) of a level instrument, in directions all round."""
     yaws = 2 * np.pi * np.arange(count) / count
     return [level_pose(np.zeros(3), yaw)[:3, :3] for yaw in yaws]
-
-
-def _detours(group: PlanningGroup, there: Pose) -> list[np.ndarray]:
-    """Corners of detours: back and up, across, and down again."""
-    here = group.cell.tips(group.joints_rad)[CUTTER]
-    detours = [[aside(group, pose, *by) for pose in (here, there)] for by in DETOURS_MM]
-    return [np.array(corners) for corners in detours if all(len(corner) for corner in corners)]
 
 
 def aside(

@@ -1,9 +1,6 @@
-"""Collision-free paths in joint space: of a tip along poses, and from one configuration to another.
-
-Kuffner and LaValle 2000, 'RRT-Connect: an efficient approach to single-query path planning',
-DOI 10.1109/ROBOT.2000.844730. Our own, as it must be repeatable from a
-seed: OMPL's generators share one global seed that can be set once per process.
-"""
+"""Collision-free paths in joint space: of a tip along poses, and from one configuration to
+another by RRT-Connect (Kuffner and LaValle 2000, DOI 10.1109/ROBOT.2000.844730). Our own, as it
+must be repeatable from a seed: OMPL's generators share one that can be set once per process."""
 
 from __future__ import annotations
 
@@ -34,12 +31,11 @@ def follow(
     poses: Float64[np.ndarray, "n 4 4"],
     near_rad: Float64[np.ndarray, " 6"] | None = None,
 ) -> Float64[np.ndarray, "n 6"]:
-    """Joint angles of the moving arm along poses of its tip (mm), free of collisions.
-
-    The cheapest path through all branches of the inverse kinematics (Viterbi): it starts near
-    ``near_rad`` (default: where the arm is) and turns joints as little as it can. Only what lies on
-    the cheapest path is tested for collisions, then struck out, until a path is free. Raises
-    Blocked: a pose out of reach, no path without a jump, or collisions on all of them."""
+    """Joint angles of the moving arm along poses of its tip (mm), free of collisions: the
+    cheapest path through all branches of the inverse kinematics (Viterbi), near ``near_rad``
+    (default: where the arm is). Only what lies on it is tested, then struck out, until a path is
+    free. Raises Blocked: a pose out of reach, no path without a jump, or collisions on all of
+    them."""
     near = group.current_rad if near_rad is None else near_rad
     _reject_early(group, poses)
     joints = _branches(group, poses)
@@ -108,8 +104,7 @@ def _cheapest(joints: np.ndarray, barred: np.ndarray, near_rad: np.ndarray) -> n
 
 
 def _checked(group: PlanningGroup, path_rad: np.ndarray) -> np.ndarray:
-    """The path, each joint moved by a whole turn where it would leave its limits; Blocked where it
-    turns by more than the limits leave, or collides between its points."""
+    """The path, joints moved by whole turns into their limits. Blocked: too far, or a collision."""
     limits_rad = group.limits_rad
     path_rad = np.where((path_rad > limits_rad).any(0), path_rad - TURN, path_rad)
     path_rad = np.where((path_rad < -limits_rad).any(0), path_rad + TURN, path_rad)
@@ -127,13 +122,8 @@ def connect(
     rng: np.random.Generator | None = None,
     detours: Sequence[Float64[np.ndarray, "c d"]] = (),
 ) -> Float64[np.ndarray, "m d"]:
-    """A smooth path of the moving joints from where they are to a goal. Raises Blocked: start or
-    goal collide, or no path was found.
-
-    Args:
-        rng: for the search; None: only the straight path and the detours are tried.
-        detours: corners of paths to try before a search, in joint space.
-    """
+    """A smooth path of the moving joints to a goal: straight, by ``detours`` (their corners), or
+    with ``rng`` by a search. Raises Blocked: start or goal collide, or no path was found."""
     start_rad = group.current_rad
     for place, joints in (("where it is", start_rad), ("where it should go", goal_rad)):
         if pair := group.collides(joints):
@@ -207,8 +197,7 @@ def _grow(
 
 
 def _shortcut(group: PlanningGroup, path: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Fewer corners, closer to the straight path: pieces between any two places on it are replaced
-    by straight segments where those are free."""
+    """Pieces between any two places are replaced by straight segments where those are free."""
     for _ in range(_SHORTCUTS):
         if len(path) == 2:
             break
@@ -225,7 +214,7 @@ def _shortcut(group: PlanningGroup, path: np.ndarray, rng: np.random.Generator) 
 
 
 def _smooth(group: PlanningGroup, corners: np.ndarray) -> np.ndarray | None:
-    """The same path with its corners rounded by a cubic B-spline, as widely as there is room."""
+    """With corners rounded by a cubic B-spline, as widely as there is room."""
     for spacing in _ROUNDING_RAD:
         control = resampled(corners, spacing, np.inf, 2)
         control = np.insert(control, [1, -1], (control[[0, -2]] + control[[1, -1]]) / 2, axis=0)
@@ -248,8 +237,7 @@ def arc_lengths(points: Float64[np.ndarray, "n d"]) -> Float64[np.ndarray, " n"]
 def resampled(
     points: Float64[np.ndarray, "n d"], step: float, norm: float = 2, least: int = 1
 ) -> Float64[np.ndarray, "m d"]:
-    """Points on a polyline, at most a step apart in this norm, its corners among them; at least so
-    many steps from corner to corner."""
+    """Points on a polyline, at most a step apart in this norm, its corners among them."""
     pieces = [
         np.linspace(a, b, max(least, int(np.ceil(np.linalg.norm(b - a, norm) / step))) + 1)[:-1]
         for a, b in itertools.pairwise(points)

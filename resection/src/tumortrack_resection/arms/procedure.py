@@ -1,8 +1,5 @@
-"""From a resection plan to motions of both arms: approach, grasp, hold, sweeps, lift, release,
-home.
-
-Also the worker that replans beside the live loop, in a process of its own.
-"""
+"""From a resection plan to motions of both arms; and the worker that replans beside the live
+loop, in a process of its own."""
 
 from __future__ import annotations
 
@@ -24,23 +21,10 @@ from tumortrack_resection.arms.cutting import Outside, Way, level_turns, turns_a
 from tumortrack_resection.arms.kinematics import Pose, upright, yaw_of
 from tumortrack_resection.arms.paths import connect, follow, out_of_reach
 from tumortrack_resection.arms.trajectory import TrajectoryBuilder, first_hit
-from tumortrack_resection.checking import checked
+from tumortrack_resection.check import checked
 from tumortrack_resection.drafts import Draft, Drafts
 from tumortrack_resection.facets import UP
-from tumortrack_resection.motions import (
-    ARMS,
-    CUTTER,
-    HOLD,
-    HOLDER,
-    JOINTS,
-    LIFT,
-    PULL,
-    RELEASE,
-    TAUT,
-    WITHDRAW,
-    Joints,
-    Motions,
-)
+from tumortrack_resection.motions import ARMS, CUTTER, HOLDER, JOINTS, Joints, Motions, Stage
 from tumortrack_resection.operation import Planned, ResectionProgress
 from tumortrack_resection.values import Cut, Located, ResectionConfig, ResectionPlan
 
@@ -64,17 +48,15 @@ _AWAY_MM = (-100.0, -50.0, 0.0, 50.0, 100.0)  # a tip's home, along each axis, w
 
 
 class Start(NamedTuple):
-    """Where the arms are (twelve joints) when they are planned for again. An instrument in tissue
-    first leaves straight back. ``from_sweep``: the grasper holds already and stays where it is;
-    begin with this sweep, counted from 1; one more than there are: lift, release and go home."""
+    """Where the arms are when they are planned for again. ``from_sweep``: the grasper holds
+    already; begin with this sweep, from 1; one more than there are: lift, release and go home."""
 
     joints_rad: Joints
     from_sweep: int | None = None
 
 
 class FacetsBlocked(Blocked):
-    """Facets that the arms can't cut, the reason being that of the first; ``numbers``: of their
-    sweeps, from 1."""
+    """Facets that the arms can't cut, by the numbers of their sweeps; the reason is the first's."""
 
     def __init__(self, blocked: dict[int, Blocked]) -> None:
         first = next(iter(blocked.values()))
@@ -91,9 +73,9 @@ def plan_motions(
     pieces: int = _MOST_PIECES,
     drafts: Drafts | None = None,
 ) -> tuple[ResectionPlan, Motions]:
-    """A plan that both arms can carry out, and their motions through the whole procedure; the same
-    every time. Pieces are tried in the order of the healthy tissue that they take; a facet that the
-    arms don't manage is left out of those that follow.
+    """A plan that both arms can carry out, and their motions; the same every time. Pieces are tried
+    in the order of the healthy tissue that they take; a facet that the arms don't manage is left
+    out of those that follow.
 
     Args:
         located: the organ as it lies now, table frame, mm.
@@ -102,8 +84,7 @@ def plan_motions(
         pieces: for so many motions are planned at most.
         drafts: of the same, if there are some already.
 
-    Raises NoPlan: nothing to cut, or the arms manage no piece, and why; InputError: an option that
-        can't be used.
+    Raises NoPlan: nothing to cut, or the arms manage no piece; InputError: no such start.
     """
     if start is not None:
         _check_start(start, cell)
@@ -177,11 +158,8 @@ def _attempt(
 
 
 def _grips(builder: TrajectoryBuilder, draft: Draft) -> Iterator[np.ndarray]:
-    """Joint paths (n, 6) straight onto the grasp, those near the arm's present place first; Blocked
-    where there is none.
-
-    How the cup is turned does not matter: it is round, and turns about the last joint alone.
-    """
+    """Joint paths straight onto the grasp, those near the arm's present place first. The cup is
+    round: how it is turned does not matter. Blocked: there is none."""
     group = builder.group(HOLDER, touching=(HOLDER,))
     turn = upright(draft.lift, yaw_of(builder.tip(HOLDER)))
     heights = np.linspace(_ABOVE_MM, 0, int(_ABOVE_MM / _STEP_MM) + 1)
@@ -211,12 +189,12 @@ def _grasp(builder: TrajectoryBuilder, grip_rad: np.ndarray, lift: np.ndarray) -
     builder.go(HOLDER, grip_rad, builder.cell.config.grasping_mm_s)
     builder.close("grasp")
     builder.wait(_VACUUM_S)
-    builder.close(HOLD)
+    builder.close(Stage.HOLD)
     if pull_mm := builder.cell.config.pull_mm:
         _rise(builder, lift, pull_mm, builder.cell.config.cutting_mm_s)
-        builder.close(PULL)
+        builder.close(Stage.PULL)
         builder.wait(_TAUT_S)
-        builder.close(TAUT)
+        builder.close(Stage.TAUT)
 
 
 def _cut_and_finish(
@@ -251,17 +229,17 @@ def _cut_and_finish(
         builder.close(f"sweep {sweep}")
     _go_home(builder, CUTTER, (HOLDER,))
     _rise(builder, draft.lift)
-    builder.close(LIFT)
+    builder.close(Stage.LIFT)
     builder.wait(_LET_GO_S)
-    builder.close(RELEASE)
+    builder.close(Stage.RELEASE)
     _go_home(builder, HOLDER, ())
     builder.close("home")
     return draft.plan(tuple(cuts)), Motions(builder.stages)
 
 
 def _withdraw(builder: TrajectoryBuilder, outside: Outside, holding: bool) -> None:
-    """Straight back with an instrument that is in tissue or too near to anything, only until it is
-    free, and up with a cup on it."""
+    """Straight back with an instrument that is in tissue or too near to anything, only until it
+    is free, and up with a cup on it."""
     here = builder.group(CUTTER, (HOLDER,))
     if here.collides(here.current_rad) is not None:
         tip = builder.tip(CUTTER)
@@ -274,7 +252,7 @@ def _withdraw(builder: TrajectoryBuilder, outside: Outside, holding: bool) -> No
             # The organ has come too near to more than the electrode: going back makes it no nearer.
             group = PlanningGroup(ArmCell(config), CUTTER, builder.joints_rad, both)
         builder.go(CUTTER, follow(group, leave), config.cutting_mm_s)
-        builder.close(WITHDRAW)
+        builder.close(Stage.WITHDRAW)
     pair = builder.cell.collisions(builder.joints_rad, (CUTTER,))
     if not holding and pair is not None and TOUCHES[HOLDER] in pair:
         builder.wait(_LET_GO_S)
@@ -304,19 +282,13 @@ def _go_home(builder: TrajectoryBuilder, arm: str, touching: tuple[str, ...]) ->
 
 
 def search_bases(
-    located: Located,
-    config: ResectionConfig,
-    cell: CellConfig,
-    drafts: Drafts | None = None,
+    located: Located, config: ResectionConfig, cell: CellConfig, drafts: Drafts | None = None
 ) -> tuple[CellConfig, ResectionPlan, Motions, str]:
-    """A plan with its motions from where the arms stand, or else from elsewhere round the table;
-    the workcell that they are for; and a note for the user on what was changed, empty: nothing.
-
-    A small fixed grid of places for both bases, on their pedestals and facing as they do: first
-    those within reach of every stroke, near to where the arms stand now; then the first for which
-    the whole procedure can be planned. Raises as ``plan_motions``: no place will do; the reason is
-    the one for the places where the arms stand now. ``drafts``: as of ``plan_motions``. An arm that
-    would meet something at home, as one whose base is on the table, gets a home near it."""
+    """A plan with its motions from where the arms stand, or else from elsewhere round the table
+    (a small fixed grid, the least change first, those within reach of every stroke); the cell
+    that they are for; and a note on what was changed. Raises as ``plan_motions``: the reason is
+    the one for where the arms stand now. An arm that would meet something at home gets a home
+    near it."""
     drafts = drafts or Drafts(located, config, cell.tools)
     given, cell = cell, _with_free_homes(cell, located)
     said = "" if cell == given else "an arm is blocked at home_rad; it has another home, nearby"
@@ -415,8 +387,8 @@ _setting: list[tuple[ResectionConfig, CellConfig, str]] = []  # of the worker
 
 
 def begin_worker(config: ResectionConfig, cell: CellConfig, urdf: str) -> None:
-    """Called once in the new process, which ignores Ctrl-C: the live loop handles it. ``urdf``: of
-    the plan's folder, by which motions are checked."""
+    """In the new process, which ignores Ctrl-C: the live loop handles it. ``urdf``: of the
+    plan's folder, by which motions are checked."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _setting.append((config, cell, urdf))
 
@@ -427,14 +399,11 @@ def warm_up() -> None:
 
 
 def replan(
-    located: Located,
-    joints_rad: Joints,
-    progress: ResectionProgress,
-    before: ResectionPlan,
+    located: Located, joints_rad: Joints, progress: ResectionProgress, before: ResectionPlan
 ) -> Planned:
-    """The plan for the organ as it lies now, from where the arms are; see ``plan_motions``. The
-    facets of the plan ``before`` are kept if that is possible, and in any case once one is cut.
-    Raises NoPlan: there is none, or it fails the check."""
+    """The plan for the organ as it lies now, from where the arms are. The facets of the plan
+    ``before`` are kept if possible, and in any case once one is cut. Raises NoPlan: there is
+    none, or it fails the check."""
     config, cell, urdf = _setting[0]
     start = Start(joints_rad, progress.first_sweep)
     like = before if len(before.facets) else None

@@ -1,8 +1,5 @@
-"""From paths to trajectories: as fast as the joints' and tips' limits allow.
-
-Pham and Pham 2018, 'A new approach to time-optimal path parameterization based on reachability
-analysis' (toppra), DOI 10.1109/TRO.2018.2819195.
-"""
+"""From paths to trajectories, as fast as the limits of joints and tips allow (Pham and Pham
+2018, toppra, DOI 10.1109/TRO.2018.2819195)."""
 
 from __future__ import annotations
 
@@ -27,18 +24,7 @@ from tumortrack_resection.arms.cell import (
 from tumortrack_resection.arms.config import CellConfig
 from tumortrack_resection.arms.kinematics import ACCELERATION_RAD_S2, Pose
 from tumortrack_resection.arms.paths import arc_lengths, follow
-from tumortrack_resection.motions import (
-    ARMS,
-    CUTTER,
-    HOLD,
-    HOLDER,
-    PULL,
-    TAUT,
-    WITHDRAW,
-    Joints,
-    Motions,
-    MotionStage,
-)
+from tumortrack_resection.motions import ARMS, CUTTER, HOLDER, Joints, Motions, MotionStage, Stage
 
 _STEP_S = 0.02  # between two samples; straight segments between them stay within 0.05 mm
 _TIP_SPEED_UP_S = 0.2  # until a tip has its speed
@@ -53,9 +39,9 @@ _THERE_RAD = 1e-6  # a thousandth of a millimetre at the tip: no motion to be ti
 _TOUCHING: dict[str, tuple[str, ...]] = {
     "approach": (),
     "grasp": (HOLDER,),
-    HOLD: (HOLDER,),
-    PULL: (HOLDER,),
-    TAUT: (HOLDER,),
+    Stage.HOLD: (HOLDER,),
+    Stage.PULL: (HOLDER,),
+    Stage.TAUT: (HOLDER,),
     "home": (),
 }
 _OVER = 1.05  # tip speeds: toppra keeps them at grid points only
@@ -64,8 +50,7 @@ Timed = tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n d"]]
 
 
 class TrajectoryBuilder:
-    """The arms' present joints (``joints_rad``), and their motion so far, stage by stage. Additions
-    to a copy (``copy.copy``) leave the original as it is."""
+    """The arms' present joints, and their motion so far. Additions to a copy leave it as it is."""
 
     def __init__(self, cell: ArmCell, start_rad: Joints, rng: np.random.Generator) -> None:
         self.cell, self.joints_rad, self.rng = cell, start_rad, rng
@@ -77,11 +62,9 @@ class TrajectoryBuilder:
         self.joints_rad, self.stages, self._pieces = other.joints_rad, other.stages, other._pieces
 
     def group(self, arm: str, touching: Collection[str] = ()) -> PlanningGroup:
-        """This arm moves from here."""
         return PlanningGroup(self.cell, arm, self.joints_rad, touching)
 
     def tip(self, arm: str) -> Pose:
-        """``table_from_tip`` now, mm."""
         return self.cell.tips(self.joints_rad)[arm]
 
     def go(
@@ -105,8 +88,7 @@ class TrajectoryBuilder:
         self.add((times, joints), cutting)
 
     def follow(self, arm: str, poses: Float64[np.ndarray, "n 4 4"], tip_mm_s: float) -> None:
-        """One arm's tip along poses that begin where it is, on or in the organ or not. Raises
-        Blocked: as ``paths.follow``."""
+        """One arm's tip along poses that begin where it is, in the organ or not. Raises Blocked."""
         self.go(arm, follow(self.group(arm, (CUTTER, HOLDER)), poses), tip_mm_s)
 
     def wait(self, seconds: float) -> None:
@@ -141,12 +123,8 @@ def along(
     tip_mm: Float64[np.ndarray, "m 3"] | None = None,
     tip_mm_s: float = 0.0,
 ) -> Timed:
-    """Times from 0 and joints (n, d) along a path, at rest at both ends. Raises Blocked: no such
-    motion (the path has a kink that can't be taken).
-
-    Args:
-        tip_mm: where the tip is at each point; its speed stays below ``tip_mm_s``.
-    """
+    """Times from 0 and joints (n, d) along a path, at rest at both ends; the tip, at ``tip_mm``,
+    stays below ``tip_mm_s``. Raises Blocked: the path has a kink that can't be taken."""
     import toppra
     from toppra import constraint
 
@@ -180,7 +158,7 @@ def along(
             break
     if best is None:
         raise Blocked("a path can't be gone within the joints' limits")
-    times = _samples(best.duration)
+    times = np.linspace(0, best.duration, int(np.ceil(best.duration / _STEP_S)) + 1)
     joints = best(times)[:, :width]
     return times * _stretched(times, joints), joints
 
@@ -194,14 +172,11 @@ def _stretched(times: np.ndarray, joints: np.ndarray) -> float:
 
 
 def first_hit(motions: Motions, config: CellConfig, organ: Mesh, begun: bool = False) -> str:
-    """A collision of these motions, and when; empty: none.
-
-    Tested as densely as by the planner, with half of its clearances: between the tested places its
-    motions come nearer than the whole ones. An electrode or cup may touch the organ only where its
-    tip is as slow as planned there. An instrument that withdraws from an organ that has come too
-    near to more than its electrode is not tested against that. ``begun``: the arms do not come from
-    home, so both tools may be at the organ in the first stage too.
-    """
+    """A collision of these motions, and when; empty: none. With half of the planner's
+    clearances, as between the places that it tests its motions come nearer. An electrode or cup
+    may touch the organ only where its tip is as slow as planned there. An instrument that
+    withdraws from an organ that has come too near to more than its electrode is not tested
+    against that. ``begun``: both tools may be at the organ in the first stage too."""
     halves = {
         name: max(getattr(config, name) / 2, 0.5)
         for name in ("clearance_mm", "organ_clearance_mm", "contact_mm")
@@ -211,7 +186,7 @@ def first_hit(motions: Motions, config: CellConfig, organ: Mesh, begun: bool = F
     slow_mm_s = _OVER * np.array([config.cutting_mm_s, config.grasping_mm_s])
     for number, stage in enumerate(motions.stages):
         cell = with_organ
-        if stage.name == WITHDRAW and cell.collisions(stage.joints_rad[0], ARMS) is not None:
+        if stage.name == Stage.WITHDRAW and cell.collisions(stage.joints_rad[0], ARMS) is not None:
             cell = ArmCell(config)
         touching = ARMS if begun and not number else _TOUCHING.get(stage.name, ARMS)
         # An arm is longest where its elbow, somewhere between the ends, is straightest.
@@ -225,7 +200,8 @@ def first_hit(motions: Motions, config: CellConfig, organ: Mesh, begun: bool = F
         )
         times_s = np.interp(at_mm, moved_mm, stage.times_s)
         allowed = _slow(cell, stage, moved_mm, at_mm, slow_mm_s) & np.isin(ARMS, touching)
-        moving = [arm for arm in ARMS if _turns(stage, arm).any()]
+        turned = np.ptp(stage.joints_rad, axis=0).reshape(len(ARMS), 6).any(1)
+        moving = [arm for arm, turns in zip(ARMS, turned.tolist(), strict=True) if turns]
         test = partial(_test, cell, joints, allowed, moving[0] if len(moving) == 1 else None)
 
         # Poses at which the same may touch the organ
@@ -238,11 +214,6 @@ def first_hit(motions: Motions, config: CellConfig, organ: Mesh, begun: bool = F
                     f"{pair[0]} would meet {pair[1]} {times_s[k]:.1f} s after {stage.name} begins"
                 )
     return ""
-
-
-def _turns(stage: MotionStage, arm: str) -> Float64[np.ndarray, " 6"]:
-    """How far each of an arm's joints turns in a stage, between its extremes."""
-    return np.ptp(stage.joints_rad[:, 6 * ARMS.index(arm) :][:, :6], axis=0)
 
 
 def _test(
@@ -270,7 +241,3 @@ def _slow(
     before = np.clip(np.searchsorted(moved_mm, at_mm, "left") - 1, 0, len(speeds) - 1)
     after = np.clip(np.searchsorted(moved_mm, at_mm, "right") - 1, 0, len(speeds) - 1)
     return np.minimum(speeds[before], speeds[after]) <= slow_mm_s
-
-
-def _samples(seconds: float) -> Float64[np.ndarray, " n"]:
-    return np.linspace(0, seconds, int(np.ceil(seconds / _STEP_S)) + 1)

@@ -33,11 +33,11 @@ class Plan(PlanOptions):
     overwrite: bool = False
 
     def run(self) -> None:
-        from tumortrack_resection import api
         from tumortrack_resection.files import KIND
+        from tumortrack_resection.planning import begin_plan
 
         store.check_place(self.plan, KIND, self.overwrite)
-        planning = api.begin_plan(self.run_folder, **options_of(self, PlanOptions))
+        planning = begin_plan(self.run_folder, **options_of(self, PlanOptions))
         say(str(planning.content.patient))
         start = time.perf_counter()
         planning = planning.with_motions() if self.arms else planning.checked()

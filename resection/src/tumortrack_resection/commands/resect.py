@@ -27,7 +27,7 @@ class Resect(ResectOptions):
         plan: folder that `plan` wrote.
         sinks: where arms, cuts and estimates go; see `track`. ur:ADDRESS is a real arm, and only
             says what it would do unless told execute=true; docs/resection.md has what that needs.
-        film: write an animated GIF: with --live of the run, else of the stored plan instead.
+        film: write an animated GIF of the stored plan instead.
     """
 
     plan: Positional[Path]
@@ -38,17 +38,19 @@ class Resect(ResectOptions):
         from tumortrack_resection.session import begin_resection
 
         if self.film is not None:
-            if self.live is None and self.sinks:
-                raise InputError("--film shows the stored plan; give it without sinks, or --live.")
+            if self.live is not None or self.sinks:
+                raise InputError(
+                    "--film shows the stored plan: give it without sinks and --live. A run is "
+                    "recorded by the sink recording:FOLDER."
+                )
             store.check_place(self.film, "", None)
-            if self.live is None:
-                say(f"A film of {self.plan}, usually within a minute: checks motions, then draws.")
+            say(f"A film of {self.plan}, within a minute or two: checks motions, then draws.")
         if self.live is not None:
             model_folder(self.live[0])
         report = self.report or track.default_report("resect")
         options = options_of(replace(self, report=report), ResectOptions)
         resection = begin_resection(self.plan, self.sinks, **options)
-        if self.film is not None and self.live is None:
+        if self.film is not None:
             _film(resection, self.film)
             return
         resection.confirm()
@@ -62,7 +64,7 @@ class Resect(ResectOptions):
                 _play(resection)
                 say(f"written to {report}.")
             else:
-                _follow(resection, self.film)
+                _follow(resection)
             _say_end(resection)
         finally:
             for line in dry_run:
@@ -89,22 +91,15 @@ def _play(resection: ResectionSession) -> None:
         resection.play(show)
 
 
-def _follow(resection: ResectionSession, film: Path | None) -> None:
-    from tumortrack_resection.film import Reel
-
+def _follow(resection: ResectionSession) -> None:
     say("starting the replanning worker ...")
-    resection.reel = None if film is None else Reel()
     with resection.following() as run:
         track.follow(run)
-    if film is not None:
-        with progress_of("frame", "choosing views and colours ...") as show:
-            resection.film_of_run(film, show)
-        say(f"written to {film}.")
 
 
 def _film(resection: ResectionSession, path: Path) -> None:
     warn(resection.stored.plan.warnings)
-    with progress_of("frame", "choosing views and colours ...") as show:
+    with progress_of("frame", "drawing ...") as show:
         length_s = resection.film(path, show)
     motion_s = resection.motions.seconds
     say(f"written to {path}: {motion_s:.0f} s of motion, shown in {length_s:.0f} s.")
