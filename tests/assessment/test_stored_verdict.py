@@ -22,13 +22,6 @@ def stored(finding):
     return replace(small_estimate(), volume=VOLUME).assessed(finding=finding)
 
 
-@pytest.mark.parametrize("finding", [None, poor("the organ hides")])
-def test_what_was_written_is_read(tmp_path, finding):
-    write_estimate(tmp_path / "run", stored(finding))
-    back = tt.load_estimate(tmp_path / "run")
-    assert (back.finding, back.quality) == (finding, "good" if finding is None else "poor")
-
-
 def test_an_assessment_survives_writing_and_reading(tmp_path):
     said = Assessment(
         bounds={"tumor_1": ErrorBound(4.5, (0.0, 0.6, 0.8)), "tumor_2": ErrorBound(np.float64(2))},

@@ -7,10 +7,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 
-from tumortrack.assessment.verdict import _within
+from tumortrack.assessment.sight import _within
 from tumortrack.core.geometry import turned_by
-from tumortrack.registration import kernels
-from tumortrack.registration.locator import nearest_lookup
+from tumortrack.registration.estimate import NODES_MM, nearest_lookup, probabilities
 
 
 @pytest.mark.parametrize("length", [0.0, 1e-9, 0.3, np.pi, 5.0])
@@ -32,7 +31,7 @@ def test_nearest_places():
     rng = np.random.default_rng(1)
     b = rng.normal(0, 30, (60, 3))
     lower, which = nearest_lookup(b)
-    nodes = lower + kernels.NODES_MM * np.stack(np.indices(which.shape), -1).reshape(-1, 3)
+    nodes = lower + NODES_MM * np.stack(np.indices(which.shape), -1).reshape(-1, 3)
     away_mm = np.linalg.norm(nodes - b[which.ravel()], axis=1)
     np.testing.assert_allclose(away_mm, cKDTree(b).query(nodes)[0], atol=1e-4)
 
@@ -40,4 +39,4 @@ def test_nearest_places():
 def test_the_normal_distribution():
     off = np.linspace(0, 9, 1000, dtype=np.float32)
     which = np.zeros(len(off), np.int32)
-    np.testing.assert_allclose(kernels.probabilities(off, np.ones(1), which), ndtr(off), atol=6e-8)
+    np.testing.assert_allclose(probabilities(off, np.ones(1), which), ndtr(off), atol=6e-8)

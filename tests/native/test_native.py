@@ -15,7 +15,7 @@ from tumortrack.native import F32, F64, I32, kernel
 ROOT = Path(__file__).parents[2]
 SOURCES = ROOT / "src" / "tumortrack" / "native"
 
-# of registration.kernels: margins, one over each standard deviation, which of them, chances
+# of registration.estimate: margins, one over each standard deviation, which of them, chances
 CHANCES = kernel("probabilities", F32["n"], F64["s"], I32["n"], F32["n"].out, result=int)
 
 

@@ -14,6 +14,7 @@ import trimesh
 
 from elastic_objects import CENTER, RADII
 from stories import answered, refusal, tumortrack
+from tumortrack.assessment.advice import Advisor
 from tumortrack.core.errors import InputError, NoEstimate, NotThisOrgan
 from tumortrack.core.evidence import (
     Free,
@@ -25,7 +26,6 @@ from tumortrack.core.evidence import (
     read_evidence,
 )
 from tumortrack.core.types import Mesh, SensorCloud
-from tumortrack.registration.advice import Advisor
 from tumortrack.registration.evidence import EvidenceTerms, Known, still_known
 from tumortrack.registration.looks import Looks
 from tumortrack.sense.ply import write_cloud_ply
@@ -95,10 +95,6 @@ def test_a_place_without_tissue_counts_inside_the_organ_alone():
     assert terms.contradicting.tolist() == [0]
 
 
-def off_mm(motion):
-    return np.linalg.norm(motion.carry(TUMOR).mean(0) - np.array(at_all(TUMOR)).mean(0))
-
-
 def at_all(points_ct):
     return TRUE.carry(points_ct)
 
@@ -108,23 +104,22 @@ def fitted(evidence):
     return method().register(looks)
 
 
+def this_way_round():
+    marked = CENTER + [20.0, 0, 30], CENTER + [0, 12.0, -30]
+    return [Landmark(point_ct=p, place_mm=at(p)) for p in marked]
+
+
 def test_evidence_where_nothing_is_seen_brings_the_answer_nearer_and_makes_it_surer():
-    alone = fitted([])
-    mean_mm = {}
-    for name, evidence in {
-        "nothing": [],
-        "touches": touches(12),
-        "outline": [Outline(places_mm=tuple(map(at, TUMOR[::20])), part="tumor_1", std_mm=0.5)],
-    }.items():
-        fit = fitted(evidence)
-        mean_mm[name] = np.linalg.norm(fit.motion.carry(VERTICES) - MOVED, axis=1).mean()
-        if evidence:
-            wide, narrow = (
-                replace(each.motion, rivals=()).std_mm(BEHIND).mean() for each in (alone, fit)
-            )
-            assert narrow < 0.95 * wide
-    assert mean_mm["touches"] < 0.9 * mean_mm["nothing"]
-    assert off_mm(fitted([every_kind()[3]]).motion) < max(off_mm(alone.motion), 0.3)
+    outline = Outline(places_mm=tuple(map(at, TUMOR[::20])), part="tumor_1", std_mm=0.5)
+    off_mm, std_mm = {}, {}
+    for name, evidence in {"nothing": [], "touches": touches(12), "outline": [outline]}.items():
+        motion = replace(fitted(evidence).motion, rivals=())
+        off_mm[name] = np.linalg.norm(motion.carry(VERTICES) - MOVED, axis=1).mean()
+        std_mm[name] = motion.std_mm(BEHIND).mean()
+    assert max(std_mm["touches"], std_mm["outline"]) < 0.95 * std_mm["nothing"]
+    assert off_mm["touches"] < 0.9 * off_mm["nothing"]
+    turned = fitted(this_way_round()).motion  # an ellipsoid fits as well after half a turn
+    assert np.linalg.norm(turned.carry(VERTICES) - MOVED, axis=1).mean() < 3
 
 
 def test_a_closed_structure_is_touched_and_outlined_as_a_part_is():
@@ -144,51 +139,33 @@ def test_a_closed_structure_is_touched_and_outlined_as_a_part_is():
         off_mm = motion.carry(artery.vertices_mm) - true.carry(artery.vertices_mm)
         off[name] = np.linalg.norm(off_mm, axis=1).mean()
     assert off["artery"] < 0.7 * off["nothing"]
-    with pytest.raises(InputError, match="'sheet'; this organ has kidney, tumor_1, artery"):
+    with pytest.raises(InputError, match="sheet"):
         EvidenceTerms.of([Touch(place_mm=at(CENTER), part="sheet")], tuple(anatomy.closed))
 
 
-def this_way_round():
-    marked = CENTER + [20.0, 0, 30], CENTER + [0, 12.0, -30]
-    return [Landmark(point_ct=p, place_mm=at(p)) for p in marked]
-
-
-def test_landmarks_tell_which_way_round_an_organ_lies():
-    """An ellipsoid fits as well turned by half a turn."""
-    turned = fitted(this_way_round())
-    assert np.linalg.norm(turned.motion.carry(VERTICES) - MOVED, axis=1).mean() < 3
-    assert turned.looks.evidence is not None
+@pytest.fixture(scope="module")
+def tracker(slim_model):
+    return Tracker(load_model(slim_model, "cpu"))
 
 
 @pytest.mark.parametrize(
     ("agree", "wrong", "decides"), [(4, 1, True), (8, 1, False), (9, 2, True), (10, 2, False)]
 )
-def test_many_that_agree_outvote_a_wrong_one(slim_model, agree, wrong, decides):
-    tracker = Tracker(load_model(slim_model, "cpu"))
+def test_many_that_agree_outvote_what_contradicts_them(tracker, agree, wrong, decides):
     away = np.array(at(BEHIND[0])) + [0, 0, 25.0]
     false = [Touch(place_mm=tuple(away + [3.0 * n, 0, 0])) for n in range(wrong)]
-    cloud = SensorCloud(SEEN.astype(np.float32))
-    found = tracker.locate(cloud, 16, 0, evidence=[*touches(agree), *false])
-    left_out = [each.left_out for each in found.report.evidence]
-    assert left_out == [False] * agree + [True] * wrong
-    assert (found.finding is not None and found.finding.kind == "evidence") == decides
-
-
-def test_what_contradicts_the_rest_is_left_out_and_named(slim_model):
-    tracker = Tracker(load_model(slim_model, "cpu"))
-    away = tuple(np.array(at(BEHIND[0])) + [0, 0, 25.0])
-    evidence = [*touches(4), Touch(place_mm=away)]
-    cloud = SensorCloud(SEEN.astype(np.float32))
-    found = tracker.locate(cloud, 16, 0, evidence=evidence)
+    cloud, right = SensorCloud(SEEN.astype(np.float32)), touches(agree)
+    found = tracker.locate(cloud, 16, 0, evidence=[*right, *false])
     told = found.report.evidence
-    assert [each.left_out for each in told] == [False] * 4 + [True]
-    assert told[4].off_mm == pytest.approx(25, abs=3)
-    assert told[4].news == pytest.approx(0, abs=1e-9)
-    assert told[4].places_mm == (away,)
-    assert all(0 < each.news <= 1 for each in told[:4])
-    assert found.finding.kind == "evidence"
-    assert found.reason.startswith("touch 5 lies")
-    rest = tracker.locate(cloud, 16, 0, evidence=evidence[:4])
+    assert [each.left_out for each in told] == [False] * agree + [True] * wrong
+    assert (found.finding is not None and found.finding.kind == "evidence") == decides
+    if decides:
+        assert found.finding.values["number"] > agree
+    assert told[agree].off_mm == pytest.approx(25, abs=3)
+    assert told[agree].news == pytest.approx(0, abs=1e-9)
+    assert told[agree].places_mm == (tuple(away),)
+    assert all(0 < each.news <= 1 for each in told[:agree])
+    rest = tracker.locate(cloud, 16, 0, evidence=right)
     apart = found.motion.carry(VERTICES) - rest.motion.carry(VERTICES)
     assert np.linalg.norm(apart, axis=1).max() < 0.5
 
@@ -215,8 +192,7 @@ def stamped(cloud, n):
     return replace(cloud, stamp_ns=1 + 33_000_000 * n)
 
 
-def test_what_was_touched_once_counts_while_the_organ_moves(slim_model):
-    tracker = Tracker(load_model(slim_model, "cpu"))
+def test_what_was_touched_once_counts_while_the_organ_moves(tracker):
     off_mm = {}
     for name, more in {"nothing": [], "touches": touches(12)}.items():
         evidence = [*this_way_round(), *more]
@@ -236,27 +212,19 @@ def test_what_was_touched_once_counts_while_the_organ_moves(slim_model):
     assert off_mm["touches"] < 0.9 * off_mm["nothing"] < 3
 
 
-def test_many_touches_of_another_place_are_named_where_the_organ_is_not_found(slim_model):
-    tracker = Tracker(load_model(slim_model, "cpu"))
+def test_many_touches_of_another_place_are_named_where_the_organ_is_not_found(tracker):
     cloud = stamped(sides(TRUE), 0)
     away = [Touch(place_mm=tuple(TRUE.centre_mm + [0, 0, -35.0]), std_mm=0.05)] * 60
-    with pytest.raises(NotThisOrgan, match="evidence is of another place: try without it"):
+    with pytest.raises(NotThisOrgan, match="evidence"):
         tracker.locate(cloud, 16, evidence=away)
     tracker.locate(cloud, 16)
-    with pytest.raises(InputError, match="1002 places; allowed: up to 1000"):
+    with pytest.raises(InputError, match=r"1002 .* 1000"):
         tracker.locate(cloud, 16, evidence=[Outline(places_mm=(TRUE.centre_mm,) * 1002, part="")])
 
 
-def test_only_the_newest_of_many_touches_are_kept():
-    many = [Known(Touch(place_mm=at(BEHIND[0]), stamp_ns=n + 1), TRUE) for n in range(900)]
-    kept, pieces = still_known(many, TRUE)
-    assert [each.stamp_ns for each in pieces] == list(range(701, 901))
-    assert [each.piece.stamp_ns for each in kept] == list(range(701, 901))
-
-
 @pytest.mark.parametrize(("away_s", "known"), [(5.0, 14), (70.0, 0)])
-def test_what_was_touched_is_still_known_when_the_organ_is_seen_again(slim_model, away_s, known):
-    follower = Follower(Tracker(load_model(slim_model, "cpu")), FollowerConfig())
+def test_what_was_touched_is_still_known_when_the_organ_is_seen_again(tracker, away_s, known):
+    follower = Follower(tracker, FollowerConfig())
     evidence = [*this_way_round(), *touches(12)]
     before, *_, after = drifting()
     follower.locate(stamped(sides(before), 0), evidence=evidence)
@@ -268,12 +236,8 @@ def test_what_was_touched_is_still_known_when_the_organ_is_seen_again(slim_model
     found = follower.locate(cloud)
     assert len(found.report.evidence) == known
     assert all(each.before for each in found.report.evidence)
-    by_now = [np.array(each.places_mm[0]) for each in found.report.evidence]
-    went_mm = [
-        np.linalg.norm(b - piece.places[0])
-        for b, piece in zip(by_now, evidence[:known], strict=True)
-    ]
-    assert went_mm == pytest.approx([16] * known, abs=5)  # as the tissue did
+    for each, piece in zip(found.report.evidence, evidence, strict=False):  # as the tissue did
+        assert np.linalg.norm(np.subtract(each.places_mm, piece.places)) == pytest.approx(16, abs=5)
     follower.forget()
     again = replace(cloud, stamp_ns=cloud.stamp_ns + int(1e8))
     assert follower.locate(again).report.evidence == ()
@@ -296,10 +260,13 @@ def test_touched_places_are_carried_as_the_tissue_goes():
     assert moved[0].std_mm == pytest.approx(np.hypot(1.0, 0.1 * way_mm), rel=0.01)
     unsure = Touch(place_mm=at(BEHIND[0]), std_mm=6.0)
     assert still_known([Known(unsure, TRUE)], TRUE) == ((), ())
+    many = [Known(Touch(place_mm=at(BEHIND[0]), stamp_ns=n + 1), TRUE) for n in range(900)]
+    kept, newest = still_known(many, TRUE)
+    assert [each.stamp_ns for each in newest] == list(range(701, 901))
+    assert [each.piece.stamp_ns for each in kept] == list(range(701, 901))
 
 
-def test_what_a_tool_holds_is_where_the_tool_is_until_it_slips(slim_model):
-    tracker = Tracker(load_model(slim_model, "cpu"))
+def test_what_a_tool_holds_is_where_the_tool_is_until_it_slips(tracker):
     first = tracker.locate(stamped(sides(TRUE), 0), 16)
     tip_mm = BEHIND[np.linalg.norm(BEHIND - TUMOR.mean(0), axis=1).argmin()]
     errors = {}
@@ -321,24 +288,23 @@ def test_what_a_tool_holds_is_where_the_tool_is_until_it_slips(slim_model):
 
 
 @pytest.mark.parametrize(
-    ("make", "words"),
+    "make",
     [
-        (lambda: Touch(place_mm=(0.0, 0.0, 5000.0)), "place_mm"),
-        (lambda: Touch(place_mm=(0.0, float("nan"), 100.0)), "place_mm"),
-        (lambda: Outline(places_mm=(), part="kidney"), "x, y, z"),
-        (lambda: Outline(places_mm=np.ones((3, 2)), part="kidney"), "x, y, z"),
-        (lambda: Touch(place_mm=((0.0, 0.0, 100.0),)), "x, y, z"),
-        (lambda: Touch(place_mm="abc"), "x, y, z"),
-        (lambda: Touch(place_mm=(0.02, 0.01, 0.15)), "in metres"),
-        (lambda: Touch(place_mm=(0.0, 0.0, 100.0), tip_mm=-1.0), "allowed: 0 to 50"),
-        (lambda: Touch(place_mm=(0.0, 0.0, 100.0), std_mm=0.0), "allowed: 0.05 to 50"),
+        lambda: Touch(place_mm=(0.0, 0.0, 5000.0)),
+        lambda: Touch(place_mm=(0.0, float("nan"), 100.0)),
+        lambda: Outline(places_mm=(), part="kidney"),
+        lambda: Outline(places_mm=np.ones((3, 2)), part="kidney"),
+        lambda: Touch(place_mm=((0.0, 0.0, 100.0),)),
+        lambda: Touch(place_mm="abc"),
+        lambda: Touch(place_mm=(0.02, 0.01, 0.15)),  # metres
+        lambda: Touch(place_mm=(0.0, 0.0, 100.0), tip_mm=-1.0),
+        lambda: Touch(place_mm=(0.0, 0.0, 100.0), std_mm=0.0),
+        lambda: EvidenceTerms.of([Outline(places_mm=((0, 0, 100.0),), part="liver")], NAMES),
     ],
 )
-def test_what_is_not_allowed_is_said(make, words):
-    with pytest.raises(InputError, match=words):
+def test_what_is_not_allowed_is_refused(make):
+    with pytest.raises(InputError):
         make()
-    with pytest.raises(InputError, match="this organ has kidney, tumor_1"):
-        EvidenceTerms.of([Outline(places_mm=((0, 0, 100.0),), part="liver")], NAMES)
 
 
 def test_the_touches_that_would_tell_most_tell_as_much_as_they_say():
@@ -359,19 +325,6 @@ def test_the_touches_that_would_tell_most_tell_as_much_as_they_say():
     middle = bent.motion.effects(bent.motion.shape.middles_ct[[1]])[0]
     found = np.linalg.eigvalsh(middle @ np.linalg.inv(precision) @ middle.T)[-1] ** 0.5
     assert found == pytest.approx(stds_mm[-1], rel=0.02)
-    rng = np.random.default_rng(0)
-    drawn = bent.motion.carry(VERTICES[rng.choice(len(VERTICES), 3, replace=False)])
-    other = EvidenceTerms.of([Touch(place_mm=p, **how) for p in drawn], NAMES)
-    precision = np.linalg.inv(bent.motion.covariance)
-    other.at(bent.motion).add_to(precision, np.zeros(len(precision)))
-    assert np.linalg.eigvalsh(middle @ np.linalg.inv(precision) @ middle.T)[-1] ** 0.5 > found
-
-
-def test_a_file_comes_back(tmp_path):
-    held = Held(point_ct=CENTER, place_mm=at(CENTER), tool="gripper", stamp_ns=5)
-    evidence = (*every_kind(), held)
-    (tmp_path / "e.json").write_bytes(evidence_json(evidence))
-    assert read_evidence(tmp_path / "e.json")[1] == evidence
 
 
 TABLE = """piece,frame,kind,part,x_mm,y_mm,z_mm,std_mm,tip_mm,x_ct_mm,y_ct_mm,z_ct_mm,stamp_ns
@@ -382,7 +335,13 @@ TABLE = """piece,frame,kind,part,x_mm,y_mm,z_mm,std_mm,tip_mm,x_ct_mm,y_ct_mm,z_
 """
 
 
-def test_a_table_says_the_same(tmp_path):
+def test_a_file_comes_back_a_table_says_the_same_and_what_is_older_than_the_pose_is_refused(
+    tmp_path,
+):
+    held = Held(point_ct=CENTER, place_mm=at(CENTER), tool="gripper", stamp_ns=5)
+    evidence = (*every_kind(), held)
+    (tmp_path / "e.json").write_bytes(evidence_json(evidence))
+    assert read_evidence(tmp_path / "e.json")[1] == evidence
     file = tmp_path / "e.csv"
     file.write_text(TABLE)
     assert read_evidence(file)[1] == (
@@ -397,19 +356,22 @@ def test_a_table_says_the_same(tmp_path):
         "line 2 is in frame 'robot'": TABLE.replace("1,camera", "1,robot"),
         "line 2, column x_mm": TABLE.replace("1.5,2", "far,2"),
         "the column 'smell'": TABLE.replace("part,", "smell,"),
-        "line 4: piece 2 has a row before": TABLE.replace("tumor_1,5", ",5"),
+        "line 4: piece 2": TABLE.replace("tumor_1,5", ",5"),
         "lacks z_mm": TABLE.replace("y_mm,z_mm,std", "y_mm,point_std_mm,std"),
         "has no rows": TABLE.splitlines()[0],
-        "line 2: not a valid": TABLE.replace("touch", "smell"),
-        "line 3: not a valid": TABLE.replace("outline,tumor_1", "outline,"),
-        "line 3: outline std_mm is 99": TABLE.replace("140,,", "140,99,").replace(
-            "139,,", "139,99,"
-        ),
+        "line 2:": TABLE.replace("touch", "smell"),
+        "line 3:": TABLE.replace("outline,tumor_1", "outline,"),
+        "std_mm is 99": TABLE.replace("140,,", "140,99,").replace("139,,", "139,99,"),
     }
     for words, given in wrong.items():
         file.write_text(given)
         with pytest.raises(InputError, match=re.escape(words)):
             read_evidence(file)
+    old = Touch(place_mm=(0.0, 0.0, 150.0), stamp_ns=5)  # older than the organ's last motion
+    content = {**json.loads(evidence_json((old,))), "still_since_ns": 6}
+    (tmp_path / "e.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="touch 1 is of 5 ns"):
+        read_evidence(tmp_path / "e.json")
 
 
 def test_touches_alone_are_an_answer(slim_model, tmp_path):
@@ -448,15 +410,16 @@ def planes(count, noise_mm=0.3, **more):
     ]  # fmt: skip
 
 
-def test_outlines_alone_are_an_answer_and_their_stated_error_counts(slim_model):
-    tracker, nothing = Tracker(load_model(slim_model, "cpu")), SensorCloud(np.zeros((0, 3)))
+NOTHING = SensorCloud(np.zeros((0, 3)))
+
+
+def test_outlines_alone_are_an_answer_and_their_stated_error_counts(tracker):
     stds = {}
     for std_mm, shared_mm in ((0.3, 0.0), (3.0, 0.0), (0.3, 3.0)):
         told = planes(12, std_mm=std_mm, shared_std_mm=shared_mm, tool="probe")
-        found = tracker.locate(nothing, 16, 0, evidence=[*told, *this_way_round()])
+        found = tracker.locate(NOTHING, 16, 0, evidence=[*told, *this_way_round()])
         tumor = found.report.parts["tumor_1"]
-        off_mm = np.linalg.norm(np.array(tumor.center_mm) - at_all(TUMOR).mean(0))
-        assert off_mm < 2
+        assert np.linalg.norm(np.array(tumor.center_mm) - at_all(TUMOR).mean(0)) < 2
         assert found.report.motion.depth_share == 0  # no camera
         stds[std_mm, shared_mm] = tumor.center_std_mm
     assert stds[3.0, 0.0] > 1.2 * stds[0.3, 0.0]
@@ -467,12 +430,10 @@ def shifted(pieces, by_mm):
     return [each.at(np.array(each.places) + by_mm, each.std_mm) for each in pieces]
 
 
-def test_in_a_frame_of_its_own_evidence_has_its_answer_there(slim_model, tmp_path):
-    nothing, away_mm = SensorCloud(np.zeros((0, 3))), np.array([400.0, -250.0, -300.0])
-    told = [*planes(12), *this_way_round()]
-    tracker = Tracker(load_model(slim_model, "cpu"))
-    here = tracker.locate(nothing, 16, 0, evidence=told)
-    there = tracker.locate(nothing, 16, 0, None, shifted(told, away_mm), "tracker")
+def test_in_a_frame_of_its_own_evidence_has_its_answer_there(tracker, slim_model, tmp_path):
+    away_mm, told = np.array([400.0, -250.0, -300.0]), [*planes(12), *this_way_round()]
+    here = tracker.locate(NOTHING, 16, 0, evidence=told)
+    there = tracker.locate(NOTHING, 16, 0, None, shifted(told, away_mm), "tracker")
     for place in ("center_mm", "box_mm"):
         a, b = (np.array(getattr(f.report.parts["tumor_1"], place)) for f in (here, there))
         np.testing.assert_allclose(b - a, np.broadcast_to(away_mm, a.shape), atol=0.3)
@@ -482,33 +443,31 @@ def test_in_a_frame_of_its_own_evidence_has_its_answer_there(slim_model, tmp_pat
     assert np.abs(off_mm).max() < 0.1
     for a, b in zip(there.report.evidence, shifted(told, away_mm), strict=True):
         np.testing.assert_allclose(a.places_mm, b.places, atol=1e-6)
-    with pytest.raises(InputError, match="camera's frame"):
+    with pytest.raises(InputError, match="camera"):
         tracker.locate(SensorCloud(SEEN), 16, 0, None, told, "tracker")
     file, out = tmp_path / "e.json", tmp_path / "out"
     content = json.loads(evidence_json(tuple(shifted(told, away_mm))))
     file.write_text(json.dumps({**content, "frame": "tracker"}))
     options = "--grid", 32, "--device", "cpu", "--evidence", file
     answered(tumortrack("locate", slim_model, "-", out, *options))
-    assert json.loads((out / "report.json").read_text())["frame"] == "tracker"
-    assert json.loads((out / "manifest.json").read_text())["frame"] == "tracker"
+    for name in ("report.json", "manifest.json"):
+        assert json.loads((out / name).read_text())["frame"] == "tracker"
 
 
-def test_one_wrong_plane_of_many_is_named_and_moves_nothing(slim_model):
-    tracker, nothing = Tracker(load_model(slim_model, "cpu")), SensorCloud(np.zeros((0, 3)))
+def test_one_wrong_plane_of_many_is_named_and_moves_nothing(tracker):
     told = [*planes(12), *this_way_round()]
-    right = tracker.locate(nothing, 16, 0, evidence=told)
+    right = tracker.locate(NOTHING, 16, 0, evidence=told)
     told[4:5] = shifted(told[4:5], [0, 0, 22.0])
-    found = tracker.locate(nothing, 16, 0, evidence=told)
+    found = tracker.locate(NOTHING, 16, 0, evidence=told)
     assert [n for n, each in enumerate(found.report.evidence) if each.left_out] == [4]
     assert found.report.evidence[4].off_mm > 10
     away_mm = found.motion.carry(VERTICES) - right.motion.carry(VERTICES)
     assert np.linalg.norm(away_mm, axis=1).mean() < 1.0
 
 
-def test_what_is_as_likely_the_other_way_round_is_said_with_its_place(slim_model):
+def test_what_is_as_likely_the_other_way_round_is_said_with_its_place(tracker):
     """Nothing tells which way round an ellipsoid lies."""
-    tracker, nothing = Tracker(load_model(slim_model, "cpu")), SensorCloud(np.zeros((0, 3)))
-    found = tracker.locate(nothing, 16, 0, evidence=planes(12))
+    found = tracker.locate(NOTHING, 16, 0, evidence=planes(12))
     others, tumor = found.report.fit_cost.others, np.array(found.report.parts["tumor_1"].center_mm)
     places = [tumor, *(np.array(each.center_mm["tumor_1"]) for each in others)]
     assert min(np.linalg.norm(place - at_all(TUMOR).mean(0)) for place in places) < 3
@@ -517,47 +476,33 @@ def test_what_is_as_likely_the_other_way_round_is_said_with_its_place(slim_model
     assert found.quality == "poor"
 
 
-def test_what_is_older_than_the_organs_last_motion_is_refused(tmp_path):
-    old = Touch(place_mm=(0.0, 0.0, 150.0), stamp_ns=5)
-    content = {**json.loads(evidence_json((old,))), "still_since_ns": 6}
-    (tmp_path / "e.json").write_text(json.dumps(content))
-    with pytest.raises(InputError, match="touch 1 is of 5 ns, before the organ lay still"):
-        read_evidence(tmp_path / "e.json")
-
-
 def test_the_command_takes_a_file_and_says_what_is_wrong_with_it(slim_model, tmp_path):
     write_cloud_ply(tmp_path / "cloud.ply", SEEN.astype(np.float32))
     file, out = tmp_path / "e.json", tmp_path / "out"
     command = "locate", slim_model, tmp_path / "cloud.ply", out, "--grid", 32, "--device", "cpu"
     content = json.loads(evidence_json((*touches(6), *this_way_round())))
+    first = content["evidence"][0]
     wrong = {
-        "frame 'robot'": {**content, "frame": "robot"},
-        "unit 'm'": {**content, "unit": "m"},
-        "not a valid": {**content, "evidence": [{"kind": "smell", "place_mm": [0, 0, 1]}]},
-        "this organ has kidney": {
-            **content, "evidence": [{**content["evidence"][0], "part": "vessel"}]
-        },
-    }  # fmt: skip
-    for words, given in wrong.items():
-        file.write_text(json.dumps(given))
+        "frame 'robot'": {"frame": "robot"},
+        "unit 'm'": {"unit": "m"},
+        "e.json": {"evidence": [{"kind": "smell", "place_mm": [0, 0, 1]}]},
+        "vessel": {"evidence": [{**first, "part": "vessel"}]},
+    }
+    for words, changed in wrong.items():
+        file.write_text(json.dumps(content | changed))
         assert words in refusal(tumortrack(*command, "--evidence", file))
         assert not out.exists()
     file.write_text(json.dumps(content))
-    said = answered(tumortrack(*command, "--evidence", file))
+    advise = "--overwrite", "--evidence", file, "--advise"
+    assert "cyst" in refusal(tumortrack(*command, *advise, "cyst"))
+    said = answered(tumortrack(*command, *advise, "kidney"))
     assert "touch 6: " in said
-    told = json.loads((out / "report.json").read_text())["assessment"]
-    assert ("next, " in said) == bool(told.get("next_evidence"))
     report = json.loads((out / "report.json").read_text())
-    assert [each["name"] for each in report["evidence"]] == ["touch"] * 6 + ["landmark"] * 2
-    assert len(report["evidence_sha256"]) == 64
-    advise = "--overwrite", "--advise"
-    said = answered(tumortrack(*command, "--evidence", file, *advise, "kidney"))
-    told = json.loads((out / "report.json").read_text())["assessment"].get("next_evidence", [])
+    told = report["assessment"].get("next_evidence", [])
     assert {each["part"] for each in told} <= {"kidney"}
     assert ("next, " in said) == bool(told)
-    assert "allowed: kidney, tumor_1" in refusal(tumortrack(*command, *advise, "cyst"))
-    away = [{**content["evidence"][0], "place_mm": [0.0, 0.0, 400.0]}]
-    file.write_text(json.dumps({**content, "evidence": away}))
-    said = answered(tumortrack(*command, "--evidence", file, "--overwrite"))
-    assert "touch 1 lies" in said
-    assert "touch the organ at" not in said
+    assert [each["name"] for each in report["evidence"]] == ["touch"] * 6 + ["landmark"] * 2
+    assert len(report["evidence_sha256"]) == 64
+    away = [{**first, "place_mm": [0.0, 0.0, 400.0]}]
+    file.write_text(json.dumps(content | {"evidence": away}))
+    assert "touch 1 lies" in answered(tumortrack(*command, "--evidence", file, "--overwrite"))

@@ -27,7 +27,7 @@ from tumortrack.registration.gauss_newton import refine
 from tumortrack.registration.looks import CAMERA_STD, Looks
 from tumortrack.registration.motion import seen_from_first
 from tumortrack.registration.search import PosePrior, Search
-from tumortrack.sense.camera import d405
+from tumortrack.sense.camera import d405, deproject
 from tumortrack.sense.files import depth_png, intrinsics_json, read_poses
 from tumortrack.sense.region import RegionConfig
 from tumortrack.sense.render import render_depth
@@ -60,10 +60,7 @@ def image(motion, camera_from_look, seed=0, camera=CAMERA):
 
 
 def points_of(frame):
-    row, column = np.nonzero(np.isfinite(frame.depth_mm))
-    z = frame.depth_mm[row, column]
-    x, y = (column - CAMERA.cx) / CAMERA.fx, (row - CAMERA.cy) / CAMERA.fy
-    return SensorCloud(np.column_stack([x * z, y * z, z]).astype(np.float32))
+    return SensorCloud(deproject(frame).astype(np.float32))
 
 
 def view(motion, camera_from_look, stated=None, seed=0):
@@ -87,14 +84,6 @@ def tracker(slim_model, monkeypatch):
 
 def located(tracker, first, *others):
     return tracker.locate(first.cloud, 16, 0, first.seen, others)
-
-
-def verdict(tracker, *views):
-    try:
-        found = located(tracker, *views)
-    except NoEstimate as error:
-        return "none", str(error)
-    return found.quality, found.reason
 
 
 def off_mm(estimate, truth):
@@ -156,36 +145,6 @@ def test_the_order_of_looks_does_not_matter(tracker):
         assert np.linalg.norm(other - found[0], axis=1).max() < 0.8
 
 
-def test_one_look_is_what_it_was(tracker):
-    points = points_of(image(placed(), np.eye(4))).points_mm[::20]
-    looks, registration = Looks.of([points]), tracker.model.registration
-    assert looks.points_mm is points
-    fit = registration.register(looks)
-    assert fit.looks is looks
-    alone = registration.best_fit(looks, registration.search.starts(looks))
-    np.testing.assert_array_equal(fit.motion.carry(INNER), alone.motion.carry(INNER))
-    assert fit.cost == alone.cost
-
-
-def test_a_correction_undoes_a_cameras_error_and_leaves_the_rest():
-    truth, config = REST, GaussNewtonConfig()
-    real = around(60, SHIFT_MM, TURN_RAD)
-    seen = [points_of(image(truth, pose)).points_mm[::25] for pose in (np.eye(4), real)]
-    looks = Looks.of(seen, [around(60)])
-    for _ in range(4):
-        fit = refine(shape(), looks, truth, config)
-        looks = looks.corrected(fit.motion, config)
-    np.testing.assert_array_equal(looks.points_mm[looks.look == 0], seen[0])
-    np.testing.assert_allclose(
-        looks.points_mm[looks.look == 1],
-        transform_points(looks.camera_from_look[1], seen[1]), atol=1e-3,
-    )  # fmt: skip
-    gone = looks.camera_from_look[1] @ np.linalg.inv(real)
-    middle = transform_points(gone, PLACE_MM[None])[0] - PLACE_MM
-    assert np.linalg.norm(middle) < 0.5
-    assert 0.3 < looks.cost < 3
-
-
 def test_what_a_further_cameras_pose_errs_by_leaves_the_organ_less_sure(monkeypatch):
     config, middle_ct = GaussNewtonConfig(), ORGAN.vertices_mm.mean(0, keepdims=True)
     seen = [points_of(image(REST, pose)).points_mm[::25] for pose in (np.eye(4), around(60))]
@@ -201,16 +160,18 @@ def test_what_a_further_cameras_pose_errs_by_leaves_the_organ_less_sure(monkeypa
 
 
 def test_a_pose_far_off_or_an_organ_that_moved_is_no_good_estimate(tracker):
-    truth, first = REST, view(REST, around(0))
-    wrong = around(60, [4.0, 3.0, -3.0])
-    quality, reason = verdict(tracker, first, view(truth, wrong, around(60)))
-    assert quality == "poor"
-    assert "view 2 shows the organ" in reason
-    assert reason.endswith("or the organ moved between the views; check the poses")
-    turned = replace(nudged(truth, [0, 0, 0], [0.3, 0.5, 0.4]), coefficients=truth.coefficients)
-    quality, reason = verdict(tracker, first, view(turned, around(60)))
-    assert quality != "good"
-    assert "check the poses" in reason
+    first, wrong = view(REST, around(0)), around(60, [4.0, 3.0, -3.0])
+    found = located(tracker, first, view(REST, wrong, around(60)))
+    assert (found.quality, found.finding.kind, found.finding.values["view"]) == ("poor", "poses", 2)
+    assert [one.cause for one in found.causes] == [Cause.POSES]
+    turned = replace(nudged(REST, [0, 0, 0], [0.3, 0.5, 0.4]), coefficients=REST.coefficients)
+    try:
+        moved = located(tracker, first, view(turned, around(60)))
+    except NoEstimate as error:
+        moved = error
+    else:
+        assert moved.quality == "poor"
+    assert [one.cause for one in moved.causes] == [Cause.POSES]
 
 
 def test_a_view_that_sees_through_refuses(tracker):
@@ -218,7 +179,7 @@ def test_a_view_that_sees_through_refuses(tracker):
     first, second = (view(truth, around(degrees)) for degrees in (0, 60))
     half = second.seen.depth_mm.copy()
     half[:, half.shape[1] // 2 :] = np.nanmax(half) + 60  # a wall where half of it should be
-    with pytest.raises(NoEstimate, match=r"sees through \d+ %.* check the poses") as refused:
+    with pytest.raises(NoEstimate) as refused:
         located(tracker, first, replace(second, seen=DepthFrame(half, CAMERA)))
     assert [one.cause for one in refused.value.causes] == [Cause.POSES]
 
@@ -231,28 +192,25 @@ def poses_json(**changed):
     return {"fixed_from_camera": poses, "unit": "mm", "frame_id": "base_link"} | changed
 
 
-BAD_POSES = {
-    "another number": ({"fixed_from_camera": [np.eye(4).tolist()]}, "1 poses for 2 views"),
-    "mirrored": (
-        {"fixed_from_camera": [np.eye(4).tolist(), np.diag([1.0, 1, -1, 1]).tolist()]},
-        "view 2 is no rigid transform",
-    ),
-    "three rows": ({"fixed_from_camera": [np.eye(4)[:3].tolist()] * 2}, "view 1 has 3 rows"),
-    "not a number": ({"fixed_from_camera": [[[float("nan")] * 4] * 4] * 2}, "view 1"),
-    "far beyond": (
-        {"fixed_from_camera": [rigid(np.eye(3), np.full(3, 1e306)).tolist()] * 2, "unit": "m"},
-        "view 1",
-    ),
-    "inches": ({"unit": "inch"}, "unit"),
-    "an unknown key": ({"robot": 1}, "robot"),
-}
+def of_poses(*poses):
+    return {"fixed_from_camera": [np.asarray(pose).tolist() for pose in poses]}
 
 
-@pytest.mark.parametrize("name", BAD_POSES)
-def test_bad_poses_are_refused(tmp_path, name):
-    changed, words = BAD_POSES[name]
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        (of_poses(np.eye(4)), "1 poses for 2 views"),
+        (of_poses(np.eye(4), np.diag([1.0, 1, -1, 1])), "view 2"),  # mirrored
+        (of_poses(np.eye(4)[:3], np.eye(4)[:3]), "view 1"),
+        (of_poses(*[np.full((4, 4), np.nan)] * 2), "view 1"),
+        (of_poses(*[rigid(np.eye(3), np.full(3, 1e306))] * 2) | {"unit": "m"}, "view 1"),
+        ({"unit": "inch"}, "unit"),
+        ({"robot": 1}, "robot"),
+    ],
+)
+def test_bad_poses_are_refused(tmp_path, changed, named):
     (tmp_path / "poses.json").write_text(json.dumps(poses_json(**changed)))
-    with pytest.raises(InputError, match=words) as refused:
+    with pytest.raises(InputError, match=named) as refused:
         read_poses(tmp_path / "poses.json", 2)
     assert "\n" not in str(refused.value)
     assert "poses.json" in str(refused.value)
@@ -279,22 +237,18 @@ def test_the_command_takes_several_views(slim_model, tmp_path):
     (tmp_path / "poses.json").write_text(json.dumps(poses_json()))
     left, right = (tmp_path / name for name in names)
     first, second = (["--intrinsics", path.with_suffix(".json")] for path in (left, right))
-    options = [*first, "--range", 50, 400, "--device", "cpu", "--grid", 32]
-    poses = ["--poses", tmp_path / "poses.json"]
-    out = tmp_path / "out"
-    command = "locate", slim_model, left
-    assert "--poses FILE with several views" in refusal(tumortrack(*command, right, out, *options))
-    assert "--poses" in refusal(tumortrack(*command, out, *options, *poses))
-    three = refusal(tumortrack(*command, right, left, out, *options, *poses))
-    assert "2 poses for 3 views" in three
+    poses, out = ["--poses", tmp_path / "poses.json"], tmp_path / "out"
+    given = [out, *first, "--range", 50, 400, "--device", "cpu", "--grid", 32]
+    for views, options, named in (
+        ([left, right], [], "--poses"),
+        ([left], poses, "--poses"),
+        ([left, right, left], poses, "2 poses for 3 views"),
+        ([left, right], poses, "320 x 180"),
+        ([left, right], [*poses, *second, *second], "3 times for 2 views"),
+    ):
+        assert named in refusal(tumortrack("locate", slim_model, *views, *given, *options))
     assert not out.exists()
-    options += poses
-    other = refusal(tumortrack(*command, right, out, *options))
-    assert "320 x 180" in other
-    thrice = refusal(tumortrack(*command, right, out, *options, *second, *second))
-    assert "--intrinsics is given 3 times for 2 views" in thrice
-    said = answered(tumortrack(*command, right, out, *options, *second))
-    assert f"written to {out}" in said
+    answered(tumortrack("locate", slim_model, left, right, *given, *poses, *second))
     report = json.loads((out / "report.json").read_text())
     looks = report["looks"]
     assert looks["clouds_sha256"] == [store.sha256_of(path) for path in (left, right)]
@@ -327,7 +281,7 @@ def test_an_organ_is_followed_by_several_cameras_and_by_one_that_goes_round(trac
 
 
 def test_a_scan_takes_three_looks_from_apart_and_says_what_each_added(tracker):
-    scan, told, second_ns = Scan(tracker), [], 10**9
+    second_ns = 10**9
 
     def seen(degrees, stamp_s, truth=REST):
         one = view(truth, around(degrees), seed=round(10 * stamp_s))
@@ -335,46 +289,37 @@ def test_a_scan_takes_three_looks_from_apart_and_says_what_each_added(tracker):
         frame = replace(one.seen, stamp_ns=cloud.stamp_ns)
         return CameraView(1, Observation(frame, 0), around(degrees)), cloud
 
-    def ask(*looks):
+    def ask(scan, *look):
+        """An answer, or the number of looks so far; -1: it was begun anew."""
         try:
-            return scan.look(*seen(*looks))
+            return scan.look(*seen(*look))
         except NoEstimate as error:
-            told.append(str(error))
-        return None
+            values = error.finding.values
+            return values.get("looks", -1) if error.finding.kind == "scan_waits" else -1
 
-    assert ask(0, 1.0) is None
-    assert ask(20, 1.5) is None  # too near the first
-    assert ask(50, 2.0) is None
-    assert [text.split(";")[0] for text in told] == [
-        *("scan: 1 of 3 looks", "scan: 1 of 3 looks", "scan: 2 of 3 looks")
-    ]
-    assert ask(-50, 7.5) is None  # the first two are over 5 s old
-    assert "1 of 3" in told[-1]
-    assert ask(0, 8.0) is None
-    found = ask(50, 9.0)
-    assert found is not None
+    scan = Scan(tracker)
+    # The third is too near the first; before the fifth the first two are over 5 s old.
+    looks = [(0, 1.0), (20, 1.5), (50, 2.0), (-50, 7.5), (0, 8.0)]
+    assert [ask(scan, *look) for look in looks] == [1, 1, 2, 1, 2]
+    found = ask(scan, 50, 9.0)
     there = transform_points(around(50), found.motion.carry(INNER))
     assert np.linalg.norm(there - REST.carry(INNER), axis=1).mean() < 1.0
     stated = [f"{mm:.1f} mm" for mm in found.report.scan.error_bound95_mm]
-    assert f"at most {', then '.join(stated)} (95 %), with one to 3 looks" in scan.summary
+    assert len(stated) == 3
+    assert ", then ".join(stated) in scan.summary
     bounds = found.assessment.bounds  # of all looks
     worst_mm = max(each.error_bound95_mm for name, each in bounds.items() if name != "kidney")
     assert stated[-1] == f"{worst_mm:.1f} mm"
     follower = Follower(tracker, FollowerConfig(rescan_s=100.0))
     follower.begin(found)  # the answer took long: the organ rests
-    cloud = seen(50, 12.0)[1]
-    assert "follow" in follower.locate(cloud).report.timings
+    assert "follow" in follower.locate(seen(50, 12.0)[1]).report.timings
     views = ViewsLocator(follower, small_setting(), RegionConfig(), 1.0, 0)
     views.scan = Scan(tracker)
-    for degrees, stamp_s in ((-50, 7.5), (0, 8.0)):
+    for look in ((-50, 7.5), (0, 8.0)):
         with pytest.raises(NoEstimate):
-            views.locate([seen(degrees, stamp_s)])
+            views.locate([seen(*look)])
     views.locate([seen(50, 9.0)])
     assert views.scanned == scan.summary  # what the live page shows from then on
-    turned = nudged(REST, [12.0, 0, 0], [0, 0, 0.3])
-    scan = Scan(tracker)
-    told.clear()
-    for degrees, stamp_s, truth in ((0, 1.0, REST), (50, 2.0, turned), (-50, 3.0, REST)):
-        assert ask(degrees, stamp_s, truth) is None
-    assert "scan, begun anew" in told[-1]
-    assert "the organ moved between the views" in told[-1]
+    turned, scan = nudged(REST, [12.0, 0, 0], [0, 0, 0.3]), Scan(tracker)
+    asked = [ask(scan, 0, 1.0, REST), ask(scan, 50, 2.0, turned), ask(scan, -50, 3.0, REST)]
+    assert asked == [1, 2, -1]  # the organ moved between the views

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from elastic_objects import CENTER, RADII, SMALL
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Motion
-from tumortrack.core.mesh_query import labels_of, surface_distance
 from tumortrack.core.types import Mesh
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import prior_precision
@@ -23,7 +22,6 @@ from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.rest_shape import RestShape, distance_of
 from tumortrack.registration.search import turned_starts
-from tumortrack.registration.uncertainty import apparent_size
 from warp_objects import (
     ANATOMY,
     PLACE_MM,
@@ -62,55 +60,21 @@ START = nudged(placed(), [4.0, -3, 5], [0.1, -0.08, 0.12])
 # --- shape ---
 
 
-@pytest.fixture(scope="module")
-def ball():
-    """Centre, radius and field of a ball."""
-    solid = trimesh.creation.icosphere(subdivisions=5, radius=20)
-    centre = np.array([100.0, 50, -300])
-    return centre, 20.0, distance_of(Mesh(solid.vertices + centre, solid.faces))
-
-
-@pytest.mark.parametrize("radius_mm", [12.0, 18.0, 19.5, 20.0, 20.5, 22.0, 26.0])
-def test_a_balls_distance_and_slope_are_the_exact_ones(ball, radius_mm):
-    centre, radius, field = ball
-    outwards = np.random.default_rng(1).normal(size=(2000, 3))
-    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
-    points = (centre + radius_mm * outwards).astype(np.float32)
-    distance, slope = with_slope(field, points)
-    error = distance - (radius_mm - radius)
-    assert np.abs(error).mean() < 0.05
-    assert np.abs(error).max() < 0.2
-    along = (slope * outwards).sum(1)
-    assert np.abs(along - 1).mean() < 0.05
-    assert np.linalg.norm(slope - outwards, axis=1).mean() < 0.1
-
-
-def test_slopes_are_the_derivatives_of_the_distance(ball):
-    centre, _, field = ball
-    points = (centre + np.random.default_rng(2).uniform(-20, 20, (500, 3))).astype(np.float32)
-    _, slope = with_slope(field, points)
-    small = 0.02  # mm; few points cross into the next cell
-    for axis, unit in enumerate(np.eye(3, dtype=np.float32)):
-        ahead, behind = (with_slope(field, points + side * small * unit)[0] for side in (1, -1))
-        wrong = np.abs((ahead - behind) / (2 * small) - slope[:, axis])
-        assert np.quantile(wrong, 0.85) < 2e-3
-        assert np.abs(slope[:, axis]).max() > 0.9
-
-
-def test_labels_are_those_of_the_surfaces():
-    points = (CENTER + np.random.default_rng(3).uniform(-1.1, 1.1, (4000, 3)) * RADII).astype(
-        np.float32
+def test_a_balls_distance_and_slope_are_the_exact_ones():
+    solid, centre = (
+        trimesh.creation.icosphere(subdivisions=5, radius=20),
+        np.array([100.0, 50, -300]),
     )
-    labels, margin_mm = shape().labels_at(points)
-    truth = labels_of(ANATOMY, points)
-    clear = np.min([surface_distance(part, points) for part in ANATOMY.parts], axis=0) > 0.5
-    assert clear.mean() > 0.9
-    np.testing.assert_array_equal(labels[clear], truth[clear])
-    assert set(labels) == {0, 1, 2}
-    assert margin_mm.min() >= 0
-    label, margin = shape().labels_at((CENTER + np.array([[0, -8, 20]])).astype(np.float32))
-    assert label == 2
-    assert margin == pytest.approx(11, abs=0.2)  # the tumor's radius, from its middle
+    field = distance_of(Mesh(solid.vertices + centre, solid.faces))
+    outwards = np.random.default_rng(1).normal(size=(1400, 3))
+    outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+    radius_mm = np.repeat([12.0, 18.0, 19.5, 20.0, 20.5, 22.0, 26.0], 200)
+    points = centre + radius_mm[:, None] * outwards
+    distance, slope = with_slope(field, points.astype(np.float32))
+    error = np.abs(distance - (radius_mm - 20))
+    assert error.reshape(7, -1).mean(1).max() < 0.05
+    assert error.max() < 0.2
+    assert np.linalg.norm(slope - outwards, axis=1).reshape(7, -1).mean(1).max() < 0.1
 
 
 def test_a_shape_survives_its_arrays():
@@ -122,16 +86,12 @@ def test_a_shape_survives_its_arrays():
         np.testing.assert_array_equal(back[name], array, err_msg=name)
     points = inside(200).astype(np.float32)
     np.testing.assert_array_equal(again.labels_at(points)[1], shape().labels_at(points)[1])
-    np.testing.assert_array_equal(again.long_axis_mm, shape().long_axis_mm)
+    np.testing.assert_allclose(np.abs(again.long_axis_mm), [0, 0, 96], atol=0.01)
     with pytest.raises(InputError, match=r"1\.values_mm"):
         RestShape.from_arrays({k: v for k, v in arrays.items() if k != "1.values_mm"}, 2)
     for wrong in (arrays["1.values_mm"][:1], np.full_like(arrays["1.values_mm"], np.nan)):
         with pytest.raises(InputError):  # a kernel would read beyond it
             RestShape.from_arrays({**arrays, "1.values_mm": wrong}, 2)
-
-
-def test_the_long_axis_is_the_ellipsoids():
-    np.testing.assert_allclose(np.abs(shape().long_axis_mm), [0, 0, 96], atol=0.01)
 
 
 # --- motion ---
@@ -158,10 +118,10 @@ def test_what_is_no_list_of_finite_points_is_refused(way, unchecked):
     ask = getattr(motion, way)
     assert np.isfinite(ask(points)).all()
     for wrong in (points[:, :2], points.T, points[0], points[None], np.hstack([points, points])):
-        with pytest.raises(InputError, match="points are n x 3"):
+        with pytest.raises(InputError):
             ask(wrong)
     points[[1, 3], 0] = np.nan, np.inf
-    with pytest.raises(InputError, match="2 of 5 points have NaN or infinity"):
+    with pytest.raises(InputError, match="2 of 5"):
         ask(points)
 
 
@@ -171,35 +131,6 @@ def test_a_librarys_states_have_a_rarity_of_one_on_average():
     assert max(rarities) > 2
     mean = dataclasses.replace(placed(), coefficients=shape().body.mean)
     assert mean.rarity == 0
-
-
-def test_standard_deviations_are_those_of_random_motions():
-    base = placed()
-    rng = np.random.default_rng(4)
-    size = np.concatenate([np.full(3, 0.3), np.full(3, 0.008), np.full(20, 0.15)])
-    mixed = rng.normal(size=(26, 26)) * size[:, None] / 5
-    covariance = mixed @ mixed.T + np.diag((0.3 * size) ** 2)
-    points = inside(40)
-    told = dataclasses.replace(base, covariance=covariance).std_mm(points)
-    places = []
-    for change in rng.multivariate_normal(np.zeros(26), covariance, 600):
-        turn = Rotation.from_rotvec(change[3:6]).as_matrix()
-        moved = ElasticMotion(
-            base.shape,
-            base.rotation @ turn,
-            base.centre_mm + base.rotation @ change[:3],
-            base.coefficients + change[6:],
-        )
-        places.append(moved.carry(points))
-    found = np.sqrt(np.var(places, axis=0).mean(1))
-    assert told.max() > 1.3 * told.min()
-    np.testing.assert_allclose(told, found, rtol=0.12)
-    assert np.mean(told / found) == pytest.approx(1, abs=0.05)
-    scaled = dataclasses.replace(base, covariance=covariance, std_scale=2.5).std_mm(points)
-    np.testing.assert_allclose(scaled, 2.5 * told)
-    assert base.std_mm(points) is None
-    many = dataclasses.replace(base, covariance=covariance).std_mm(np.tile(points, (150, 1)))
-    np.testing.assert_allclose(many.reshape(150, 40), np.tile(told, (150, 1)), rtol=1e-4)
 
 
 # --- refinement ---
@@ -282,7 +213,7 @@ def test_a_wrong_scale_of_the_camera_shows_in_the_fit(times):
     points = times * surface(placed(), 1000)
     start = dataclasses.replace(START, centre_mm=times * START.centre_mm)
     fit = refined(points, start, config)
-    size = apparent_size(fit.motion, fit.looks, config)
+    size = fit.looks.apparent_size(fit.motion, config)
     # The robust kernel reads too little.
     assert abs(size.times - times) < 0.6 * abs(times - 1) + 0.01
     assert (size.gain > 9.2) == (times != 1)
@@ -300,10 +231,11 @@ def test_every_step_lowers_the_cost_and_enough_steps_end():
     assert costs[4] <= costs[3] * 1.001
     assert costs[4] < 0.1 * costs[0]
     assert fits[4].steps < 40
-    starts = [nudged(placed(), [0, 0, 60], [0, 0, 0]), START]
-    best = method(steady).best_fit(Looks.of([points]), starts)
-    alone = refined(points, START, steady)
-    assert 0.97 * alone.cost < best.cost <= alone.cost
+    alone, far = refined(points, START, steady), nudged(placed(), [0, 0, 60], [0, 0, 0])
+    for starts in ([START, far], [far, START]):  # the best wins wherever it stands
+        best = method(steady).best_fit(Looks.of([points]), starts)
+        # A little less where a start beside it ends nearer to the minimum.
+        assert 0.97 * alone.cost < best.cost <= alone.cost
 
 
 def test_starts_beside_a_fit_are_as_unlikely_as_was_asked_and_lead_back_to_it():

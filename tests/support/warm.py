@@ -24,7 +24,7 @@ PRELOADED = (
     "skimage.measure",
     "tumortrack.cli.main",
     "tumortrack.tracking.presets",
-    "tumortrack.registration.build",
+    "tumortrack.registration.model",
     "tumortrack.report.protocol",
     "tumortrack.imaging.case",
     "tumortrack_occupancy.training.train",

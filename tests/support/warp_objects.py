@@ -12,14 +12,13 @@ from scipy.spatial.transform import Rotation
 from elastic_objects import SMALL, UP, organ
 from tumortrack.core.types import Anatomy
 from tumortrack.models.folder import save_model
-from tumortrack.registration import kernels
-from tumortrack.registration.build import build_model
 from tumortrack.registration.config import GaussNewtonConfig, RegistrationConfig
 from tumortrack.registration.gauss_newton import GaussNewton, RegistrationResult, refine
 from tumortrack.registration.looks import Looks
+from tumortrack.registration.model import build_model
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.registration import Registration
-from tumortrack.registration.rest_shape import RestShape, distances_of
+from tumortrack.registration.rest_shape import DistanceField, RestShape, distances_of
 from tumortrack.registration.search import PosePrior
 from tumortrack.simulate.deform import ElasticConfig
 from tumortrack.simulate.elastic.body import build_body
@@ -55,7 +54,7 @@ def nudged(motion: ElasticMotion, shift_mm: ArrayLike, turn_rad: ArrayLike) -> E
     )
 
 
-def with_slope(field: kernels.DistanceField, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def with_slope(field: DistanceField, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """A field's distances at points (n, 3), and their slopes, both trilinear."""
     nodes = np.arange(2)
     distances, slopes = np.empty(len(points)), np.empty((len(points), 3))

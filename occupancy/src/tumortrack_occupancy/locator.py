@@ -14,10 +14,10 @@ from jaxtyping import Float32
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.evidence import Evidence
-from tumortrack.core.report import Finding
+from tumortrack.core.report import Finding, FitReport
 from tumortrack.core.types import Anatomy, CameraLabels, Look, OccupancyCloud, SensorCloud
 from tumortrack.models.in_distribution import check_in_distribution
-from tumortrack.models.report import Frame, Rng, describe_parts, grid_over
+from tumortrack.models.report import Frame, Rng, describe_parts, grid_over, residuals
 from tumortrack_occupancy import volume
 from tumortrack_occupancy.inference import Inference
 from tumortrack_occupancy.kernels import leading
@@ -176,5 +176,12 @@ class _Frame(Frame):
             inside = volume.drop_islands(inside, labels, kept, camera_from_index)
             meshes = volume.part_surfaces(margins, kept, camera_from_index, names)
         parts = describe_parts(names, meshes, inside)
-        report = self.report(distances_mm, parts, voxel_mm=float(camera_from_index[0, 0]))
+        report = FitReport(
+            parts=parts,
+            seed=self.seed,
+            points=len(self.cloud.points_mm),
+            voxel_mm=float(camera_from_index[0, 0]),
+            fit_mm=residuals(distances_mm),
+            timings=self.timings,
+        )
         return Estimate(inside, CameraLabels(kept, camera_from_index), meshes, report)

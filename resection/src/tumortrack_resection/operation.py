@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
-from tumortrack.assessment.advice import advise, worthwhile
+from tumortrack.assessment.advice import Place, Reach, advise, worthwhile
 from tumortrack.core.colours import CUT, ENERGISED, NOW, TO_CUT
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
@@ -25,7 +25,6 @@ from tumortrack.core.geometry import Affine, transform_points
 from tumortrack.core.halt import CUT_NOTE, Halt
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import Polyline, RigidShape, TrackingResult, Workcell
-from tumortrack.registration.advice import Place, Reach
 from tumortrack_resection.budget import MOVED_MM, LiveBudget
 from tumortrack_resection.grip import Grip
 from tumortrack_resection.motions import CUTTER, JOINTS, Execution, Joints, Motions, Stage

@@ -1,4 +1,4 @@
-"""Likely causes of a poor estimate, or of none, the likeliest first.
+"""Likely causes of a poor estimate, or of none, the likeliest first, and what to do about them.
 
 Each cause needs evidence. Points that fit as well as usual once a cause is undone (turned to the
 camera, mirrored, in another unit, scaled in x and y) have that cause; the others follow from how
@@ -8,50 +8,98 @@ much of the organ the points show, how far from it they lie, and how flat or rou
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool, Float
 
-from tumortrack.assessment.advice import near_side, unseen
+from tumortrack.assessment.advice import Advisor, least_sure
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.geometry import Points, rotation_onto
+from tumortrack.core.geometry import Points, rotation_onto, transform_points, triangles_of
 from tumortrack.core.report import Cause, Check, Likely
 from tumortrack.core.tables import read_table
-from tumortrack.core.types import Mesh, SensorCloud
+from tumortrack.core.types import Look, Mesh, SensorCloud
 from tumortrack.models.in_distribution import spread_mm
 from tumortrack.models.model import Model
 from tumortrack.registration.gauss_newton import refine
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
+from tumortrack.registration.motion import ElasticMotion
 from tumortrack.sense.cloud import thin_cloud
 from tumortrack.sense.units import Unit, likely_unit
 
 # By cause: what it is called, and what to do about it.
 _WORDS = read_table("tumortrack.assessment", "causes.toml", dict[str, tuple[str, str]])
 _POINTS = 400  # of a trial fit
-# A trial must cost less than so many times the usual and the present cost; right: 0.1 to 0.5.
+# What these limits rest on: docs/decisions/034-limits.md.
+# A trial must cost less than so many times the usual and the present cost.
 _FITS, _BETTER = 1.0, 0.6
 _XY_SCALES = 0.5, 0.75, 1.33, 2.0  # of a wrong focal length
 _STARTS = 2  # of the search that are refined
 _BEYOND_D405, _BEYOND_CAMERAS = 0.64, 0.5  # cosine to z: outside a D405's view, any usual camera's
 _FACING = 0.5  # cosine between the bulging side and the camera
 _TURNED_MM = 170.0  # from the camera, about where training has organs
-# Thickness, and distance from the best sphere, per spread: organs have more than 0.09 and 0.06.
-_FLAT, _ROUND = 0.04, 0.02
-# Background: distance from the surface, share of the points, and times the usual cost without them
-# (other kidneys have 0.9).
+_FLAT, _ROUND = 0.04, 0.02  # thickness, and distance from the best sphere, per spread
+# Background: distance from the surface, share of the points, and times the usual cost without them.
 _BACKGROUND_MM, _BACKGROUND_SHARE, _FITS_WITHOUT = 10.0, 0.03, 0.85
 _NOT_THIS = "fit", "seen_through"  # checks that speak against this organ in this place
 _NEARLY = 0.9  # of the usual cost: nine tenths of the right fits cost less
 _GUESSED = (Cause.ANOTHER_PATIENT,)
-# Noise may be the cause of all that is left, which then tells no patient from another: of right
-# answers at 1 mm one in eight is poor, as without noise, at 3 mm all (make noise).
+# Noise may be the cause of all else, and then tells no patient from another.
 _NOISY_MM, _OF_BAD_FITS = 1.0, (Cause.ANOTHER_PATIENT, Cause.DEFORMED)
 _HELPED_BY_A_VIEW = Cause.HIDDEN, Cause.ANOTHER_PATIENT, Cause.VIEW
-# Hidden shares of the near side, and the points' spread relative to the near side's. Other
-# patients' kidneys, fitted wrong, leave up to 0.3 of it without points, or spread as widely.
+# Hidden shares of the near side, and the points' spread relative to the near side's.
 _HIDDEN, _MOSTLY_HIDDEN, _SMALL_SPREAD = 0.15, 0.3, 0.8
+
+_OF_POSES = "none", "poses", "fit", "strays", "seen_through"  # checks that wrong poses fail
+_NOTHING_HIDES = 0.9  # of the organ's image is in sight; the rest has no return, as at its edges
+TOUCH_MORE = "touch more places, all over what can be reached of it"
+_MAX_SAMPLES = 2000  # faces of the organ that are looked at
+_MIN_COSINE = 0.3  # to the line of sight: surfaces at a flatter angle return little
+_SEEN_WITHIN_MM = 8.0  # of an observed point
+_MAX_HIDDEN = 0.1  # share of the side that faces the camera
+_MIN_SINE = 0.3  # to the line of sight: below it, a direction is along the view
+Known = Mapping[str, tuple[Likely, ...]]
+
+
+def explained(
+    model: Model, looks: Sequence[Look], estimate: Estimate, known: Known
+) -> tuple[tuple[Likely, ...], str]:
+    """Causes of a poor estimate, and what probably happened and what to do, in words. ``known``:
+    recent causes by failed check, which are not searched for again."""
+    causes = causes_of(model, looks, estimate, known)
+    alone = isinstance(looks[0].seen, SensorCloud) and not len(looks[0].seen.points_mm)
+    # Touches hide nothing, and no camera can look elsewhere.
+    in_sight = estimate.report.in_sight
+    hides = not alone and (in_sight is None or in_sight < _NOTHING_HIDES)
+    if not hides:
+        causes = tuple(c for c in causes if c.cause is not Cause.HIDDEN) or (Likely(Cause.VIEW),)
+    view = TOUCH_MORE if alone else where_to_look(estimate, looks, hides)
+    return causes, words(causes, view)
+
+
+def causes_of(
+    model: Model, looks: Sequence[Look], estimate: Estimate | None, known: Known
+) -> tuple[Likely, ...]:
+    """With those that looks, evidence and frames before tell; None: there is no estimate."""
+    check = check_of(estimate)
+    if len(looks) > 1 and check in _OF_POSES:
+        return (Likely(Cause.POSES),)
+    pieces = () if estimate is None else estimate.report.evidence
+    # The piece that lies the farthest from where the rest has it.
+    out = [(each.off_mm, number) for number, each in enumerate(pieces, 1) if each.left_out]
+    wrong = (Likely(Cause.EVIDENCE, max(out)[1]),) if out else ()
+    before = tuple(c for c in known.get(check, ()) if c.cause is not Cause.EVIDENCE)
+    return *wrong, *(before or likely_causes(model, looks[0].cloud, estimate))
+
+
+def check_of(estimate: Estimate | None) -> str:
+    """The check that it failed; ``none`` without an estimate."""
+    if estimate is None:
+        return "none"
+    return "" if estimate.finding is None else estimate.finding.check
 
 
 def likely_causes(
@@ -157,11 +205,9 @@ def _by_coverage(model: Model, points: Points, fit: _Fit) -> list[Likely]:
         large = Likely(Cause.BACKGROUND, float(far.mean()))
         small = Likely(Cause.ANOTHER_PATIENT if spread >= least else Cause.OBJECT)
         return [large if spread > most else small]
-    from scipy.spatial import cKDTree  # slow to import
-
-    near = near_side(organ)
-    background = float((cKDTree(organ.vertices_mm).query(points)[0] > _BACKGROUND_MM).mean())
-    hidden = float(unseen(near, points).mean()) if len(near) else 0.0
+    near = _near_side(organ)
+    background = float((_nearest_mm(points, organ.vertices_mm) > _BACKGROUND_MM).mean())
+    hidden = float(_unseen(near, points).mean()) if len(near) else 0.0
     mostly = hidden > _MOSTLY_HIDDEN and spread_mm(points) < _SMALL_SPREAD * spread_mm(near)
     fits_without = background > _BACKGROUND_SHARE and fit.without_strays < _FITS_WITHOUT
     if check == "strays" or fits_without:
@@ -201,3 +247,66 @@ def _off_axis(points: Points, cosine: float) -> bool:
     """Whether they lie farther from the camera's axis than this."""
     middle = np.median(points, 0)
     return bool(middle[2] < cosine * np.linalg.norm(middle))
+
+
+def where_to_look(estimate: Estimate, looks: Sequence[Look], hides: bool = True) -> str:
+    """The side of the organ that the camera should look at, in words. ``hides``: something may hide
+    a part of it.
+
+    If so, and if no view has points on more than a tenth of the side that faces the camera: that
+    part. Otherwise from where a look would tell most of the least sure tumor. Sides are those of
+    the first look's image.
+    """
+    organ = estimate.organ_mesh
+    facing, centre = _near_side(organ), organ.vertices_mm.mean(0)
+    points_mm = np.concatenate(
+        [transform_points(look.camera_from_look, look.cloud.points_mm) for look in looks]
+    )
+    camera = "the first camera's" if len(looks) > 1 else "the camera's"
+    if hides and len(facing) and len(points_mm):
+        hidden = _unseen(facing, points_mm)
+        direction = facing[hidden].mean(0) - centre if hidden.mean() > _MAX_HIDDEN else np.zeros(3)
+        if side := _side_in_words(direction, centre, camera):
+            return f"free the view of the organ's side towards {side}, or look from there"
+    motion, report, best_mm = estimate.motion, estimate.report, np.zeros(3)  # the camera's own
+    if isinstance(motion, ElasticMotion) and motion.covariance is not None and report.tumors:
+        advised = Advisor(motion, least_sure(report)).looks()
+        best_mm = np.array(min(advised, key=lambda look: look.then_std_mm).place_mm)
+    side = _side_in_words(best_mm - centre, centre, camera)
+    return f"look more from {side or 'another side'}, by about 30 degrees"
+
+
+def _near_side(organ: Mesh) -> Float[np.ndarray, "n 3"]:
+    """Centroids of triangles that face the camera, of evenly chosen ones."""
+    faces = organ.faces[:: len(organ.faces) // _MAX_SAMPLES + 1]
+    centroids, normals = triangles_of(organ.vertices_mm, faces)
+    sight = centroids / np.linalg.norm(centroids, axis=1, keepdims=True)
+    return centroids[-(normals * sight).sum(1) > _MIN_COSINE * np.linalg.norm(normals, axis=1)]
+
+
+def _unseen(surface_mm: Points, points_mm: Float[np.ndarray, "_ 3"]) -> Bool[np.ndarray, " n"]:
+    """Which places on a surface have no observed point near them."""
+    return _nearest_mm(surface_mm, points_mm) > _SEEN_WITHIN_MM
+
+
+def _nearest_mm(from_mm: Points, points_mm: Float[np.ndarray, "_ 3"]) -> Float[np.ndarray, " n"]:
+    """Distance from each place to the nearest point."""
+    from scipy.spatial import cKDTree  # slow to import
+
+    return np.asarray(cKDTree(points_mm).query(from_mm)[0])
+
+
+def _side_in_words(
+    direction: Float[np.ndarray, " 3"], centre: Float[np.ndarray, " 3"], camera: str
+) -> str:
+    """A direction as the camera's image shows it; empty if it is along the view."""
+    sight, length = centre / np.linalg.norm(centre), float(np.linalg.norm(direction))
+    x, y, _ = direction - (direction @ sight) * sight
+    if np.hypot(x, y) <= _MIN_SINE * length:
+        return ""
+    words = {"x": ("left", "right"), "y": ("top", "bottom")}
+    larger = max(abs(x), abs(y))
+    shown = {axis: value for axis, value in (("y", y), ("x", x)) if abs(value) > larger / 2}
+    names = " ".join(words[axis][int(value > 0)] for axis, value in shown.items())
+    axes = ", ".join(f"{'+' if value > 0 else '-'}{axis}" for axis, value in shown.items())
+    return f"the {names} ({camera} {axes})"

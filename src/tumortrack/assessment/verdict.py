@@ -2,65 +2,54 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool
 
-from tumortrack.assessment.advice import with_bounds, worthwhile
 from tumortrack.assessment.bound import POOR_MM, bounds_of, depths_within_mm
-from tumortrack.core.assessment import ErrorBound, deciding
+from tumortrack.assessment.sight import Sight, sight_of
+from tumortrack.core.assessment import Assessment, ErrorBound, deciding
 from tumortrack.core.errors import NotThisOrgan
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.geometry import transform_points
 from tumortrack.core.report import EvidenceReport, Finding, FitReport, Kind, LooksReport
-from tumortrack.core.types import DepthFrame, Intrinsics, Look, Mesh, SensorCloud
+from tumortrack.core.types import Look
 from tumortrack.models.in_distribution import FIT_FACTOR, RIVAL_COST
 from tumortrack.sense.noise import CAMERA_STD
-from tumortrack.sense.render import render_depth
 
 # Where no bound is known: largest standard deviation of a tumor's centre, and largest
 # distance to it in another fit that is nearly as likely.
 _MAX_UNCERTAINTY_MM = 3.0
-# Shares of the organ's image that are seen through. Right estimates have up to 0.03 (moving and
-# pushed, on tables, in beds and cavities, among instruments and hands), an organ upside down 0.12
-# to 0.16, one fitted to a hand 0.2 to 0.4, one of another patient's kidney mostly 0.1 to 0.24.
-_LIMITS = 0.05, 0.09  # doubtful, impossible
-# Without a motion surfaces are rougher: with centres 2 to 8 mm off, 0.09 to 0.15 are usual.
-_ROUGH_LIMITS = 0.1, 0.2
-_ON = 1 / 3  # of what is behind: on the surface
-_AGAINST = 3.0  # pixels that a pixel that is seen through outweighs
-_WIDTH = 212  # pixels of the depth image in which the organ is compared
+# What these limits rest on: docs/decisions/034-limits.md. Shares of the organ's image that are seen
+# through: doubtful, impossible; without a motion surfaces are rougher.
+_LIMITS, _ROUGH_LIMITS = (0.05, 0.09), (0.1, 0.2)
 # The doubt about an earlier estimate stays if less than this share of what was in sight then is in
 # sight now, unless the organ moved by more than this from one frame to the next.
 _AS_MUCH, _MOVED_MM = 0.9, 10.0
-_THROUGH_MM = 6.0  # points so far behind the estimated surface are behind the organ, or, of a
-_NOISES = 3.0  # noisy camera, so many standard deviations of it
-# If the camera sees the surroundings in more than this share of a rim so many pixels (some 3 mm)
-# wide round the organ, most wrong places are seen through. The fit is then judged without strays
-# and may cost ``FIT_FACTOR`` times the usual cost: in a wider world than training's (make world)
-# the cost alone, without strays up to 1.5 times the usual one, rejected 18 answers, all right.
-_RIM_SHARE, _RIM = 0.5, 2
+# If the camera sees the surroundings in more than this share of a rim round the organ, most wrong
+# places are seen through. The fit is then judged without strays, and may cost ``FIT_FACTOR`` times
+# the usual cost.
+_RIM_SHARE = 0.5
 _MAX_STRAYS = 0.5  # share of the points: the breakdown point of robust estimates
 _MAX_CAMERA_ERROR = 3.0  # standard deviations of a camera's pose
 _FAR_TILTED, _UPSIDE_DOWN = 60.0, 110.0  # degrees
 _MIN_PROBABILITY = 0.6  # mean over a tumor's points
-# Pieces of evidence: of earlier frames; of this one, that agree, also for each that does not. Of 12
-# touches with 5 % false ones 29 % of the answers were poor for one that was left out.
+# Pieces of evidence: of earlier frames; of this one, that agree, also for each that does not.
 _FEW, _MANY, _FOR_EACH = 3, 8, 5
-_PIXEL_MM = 1.5  # of the image in which a cloud is compared
-_MAX_PIXELS = 1024  # along a side
-_MAX_POINTS = 20_000  # of a cloud: enough for the shares, where all of 400,000 would delay a frame
-# Largest share of the organ's image without points of a cloud: up to 0.03 if the whole side that
-# faces the camera was scanned (80 scenes, two kinds of deformation). An organ upside down reaches
-# far beyond the points that it fits.
-_MAX_UNSEEN = 0.1
-_SEEN_WITHIN_MM = 6.0  # of a point, or twice the points' usual distance
+_MAX_UNSEEN = 0.1  # share of the organ's image without points of a cloud
+_OUTVOTED = 3  # later pieces at that place that agree with the answer, and so with each other
+_THERE_MM = 15.0  # from what the answer has there: how far apart touches of one spot may lie
+_OF_A_MOMENT = "held", "free"  # they say it again in each frame, as long as it is so
 
 
 def judged(
-    estimate: Estimate, looks: Sequence[Look], strictly: bool = False, factor: float = 1.0
+    estimate: Estimate,
+    looks: Sequence[Look],
+    strictly: bool = False,
+    factor: float = 1.0,
+    last: Estimate | None = None,
 ) -> Estimate:
     """The estimate with its bounds and the finding that makes it poor, if any, and in its report
     the shares of the organ that are seen through, in sight and, of a cloud, not seen.
@@ -75,69 +64,66 @@ def judged(
         looks: at the organ; of each share, the worst counts.
         strictly: the fit must be no worse than usual, whatever the camera sees round the organ.
         factor: by which the bounds are multiplied.
+        last: of the frame before; a doubt about it may last.
     """
-    views = _organ_before_cameras(estimate, looks)
-    images, clouds = [], []
-    for (organ, seen), look in zip(views, looks, strict=False):  # a network takes the first alone
-        if isinstance(seen, DepthFrame):
-            images.append(seen_through(organ, seen, _behind_mm(look)))
-        elif len(seen.points_mm):  # touches alone hide nothing, and are no scan
-            clouds.append(cloud_shares(organ, seen, _behind_mm(look)))
-    unseen = max((share for _, share in clouds), default=0.0)
-    rim_share = min((share for _, share, _ in images), default=0.0) if not clouds else 0.0
-    by_depth = max((share for share, _, _ in images), default=0.0)
-    through = max(by_depth, *(share for share, _ in clouds), 0.0)
+    start_s, sight = time.perf_counter(), sight_of(estimate, looks)
     doubtful, impossible = _LIMITS if estimate.motion is not None else _ROUGH_LIMITS
-    if by_depth > impossible:
-        raise NotThisOrgan(Finding("organ_seen_through", {"percent": 100 * by_depth}))
-    report = msgspec.structs.replace(
-        estimate.report, unseen=unseen if clouds else estimate.report.unseen
-    )
+    if sight.by_depth > impossible:
+        raise NotThisOrgan(Finding("organ_seen_through", {"percent": 100 * sight.by_depth}))
+    report = estimate.report
+    if sight.unseen is not None:
+        report = msgspec.structs.replace(report, unseen=sight.unseen)
     bounds = bounds_of(report, factor)
-    finding = _misplaced_camera(report.looks)
-    finding = finding or _misfit(report, rim_share > _RIM_SHARE and not strictly)
-    finding = finding or _doubt(report, bounds)
-    in_sight = images[0][2] if images else None
-    if through > doubtful:
-        finding = Finding("seen_through", {"percent": 100 * through})
-    elif unseen > _MAX_UNSEEN and finding is None and not _deciding(report, bounds):
-        finding = Finding("unseen", {"percent": 100 * unseen})
-    advice = worthwhile(with_bounds(report, estimate.assessment.next_evidence, factor))
-    judged = estimate.assessed(bounds=bounds, factor=factor, finding=finding, next_evidence=advice)
-    return judged.reporting(
-        unseen=report.unseen,
-        seen_through=through,
-        in_sight=in_sight,
-        doubted_in_sight=(in_sight or 0.0) if through > doubtful else None,
+    finding = finding_of(report, bounds, sight, doubtful, strictly)
+    doubted = (sight.in_sight or 0.0) if sight.through > doubtful else None
+    if doubted is None and last is not None and _still_hidden(estimate, sight, last):
+        doubted = last.report.doubted_in_sight
+        finding = finding or Finding("hidden_now")
+    report = msgspec.structs.replace(
+        report,
+        seen_through=sight.through,
+        in_sight=sight.in_sight,
+        doubted_in_sight=doubted,
+        timings=timed(report, "judge", start_s),
     )
+    assessment = Assessment(bounds=bounds, factor=factor, finding=finding)
+    return replace(estimate, report=report, assessment=assessment)
 
 
-def _organ_before_cameras(
-    estimate: Estimate, looks: Sequence[Look]
-) -> list[tuple[Mesh, DepthFrame | SensorCloud]]:
-    """For each camera, the organ in its (corrected) frame, and all that it saw."""
-    organ, corrected = estimate.organ_mesh, estimate.report.looks
-    views = [(organ, looks[0].seen)]
-    if corrected is not None:
-        for look, pose in zip(looks[1:], corrected.camera_from_look[1:], strict=True):
-            look_from_camera = np.linalg.inv(np.array(pose))
-            vertices_mm = transform_points(look_from_camera, organ.vertices_mm)
-            views.append((organ.moved(vertices_mm), look.seen))
-    return views
+def timed(report: FitReport, stage: str, start_s: float) -> dict[str, float]:
+    """The report's timings with those of a stage that ends now."""
+    took_s, timings = time.perf_counter() - start_s, report.timings
+    all_s, total_s = took_s + timings.get(stage, 0.0), took_s + timings.get("total", 0.0)
+    return {**timings, stage: all_s, "total": total_s}
 
 
-def doubt_if_hidden(estimate: Estimate, last: Estimate) -> Estimate:
-    """The estimate, poor if the camera saw through the ``last`` one at the same place and sees less
-    of it now: what hides the organ since then is no evidence that it is there."""
-    doubted_at, report = last.report.doubted_in_sight, estimate.report
-    if doubted_at is None or report.doubted_in_sight is not None:
-        return estimate
-    in_sight = 1.0 if report.in_sight is None else report.in_sight
+def _still_hidden(estimate: Estimate, sight: Sight, last: Estimate) -> bool:
+    """Whether the camera saw through the ``last`` one at the same place and sees less of it now:
+    what hides the organ since then is no evidence that it is there."""
+    if last.report.doubted_in_sight is None:
+        return False
+    in_sight = 1.0 if sight.in_sight is None else sight.in_sight
     moved_mm = np.abs(estimate.organ_mesh.box_mm - last.organ_mesh.box_mm).max()
-    if in_sight >= _AS_MUCH * doubted_at or moved_mm > _MOVED_MM:
-        return estimate
-    estimate = estimate.reporting(doubted_in_sight=doubted_at)
-    return estimate.assessed(finding=estimate.finding or Finding("hidden_now"))
+    return bool(in_sight < _AS_MUCH * last.report.doubted_in_sight and moved_mm <= _MOVED_MM)
+
+
+def finding_of(
+    report: FitReport,
+    bounds: Mapping[str, ErrorBound],
+    sight: Sight,
+    doubtful: float = _LIMITS[0],
+    strictly: bool = False,
+) -> Finding | None:
+    """What makes an estimate poor; None: nothing does. ``doubtful``: share that is seen through."""
+    if sight.through > doubtful:
+        return Finding("seen_through", {"percent": 100 * sight.through})
+    finding = _misplaced_camera(report.looks)
+    finding = finding or _misfit(report, sight.rim > _RIM_SHARE and not strictly)
+    finding = finding or _doubt(report, bounds)
+    unseen = sight.unseen or 0.0
+    if finding is None and unseen > _MAX_UNSEEN and not _deciding(report, bounds):
+        return Finding("unseen", {"percent": 100 * unseen})
+    return finding
 
 
 def _misplaced_camera(looks: LooksReport | None) -> Finding | None:
@@ -173,7 +159,9 @@ def _doubt(report: FitReport, bounds: Mapping[str, ErrorBound]) -> Finding | Non
         return Finding("size", {"times": size.times})
     if cost is not None and cost.beyond is not None:
         degrees = cost.beyond.tilt_degrees
-        return Finding(_tilt_finding(degrees), {"degrees": degrees})
+        turned: Kind = "tilted" if degrees > _FAR_TILTED else "not_turned"
+        kind: Kind = "upside_down" if degrees > _UPSIDE_DOWN else turned
+        return Finding(kind, {"degrees": degrees})
     if (finding := _contradiction(report.evidence)) is not None:
         return finding
     for name, part in report.parts.items():
@@ -187,14 +175,8 @@ def _doubt(report: FitReport, bounds: Mapping[str, ErrorBound]) -> Finding | Non
     depth_mm = depths_within_mm(report, name)
     if 2 * depth_mm**2 > bound_mm**2:  # most of it
         return Finding("depths", {"depth_mm": depth_mm})
-    digits = _telling(bound_mm, POOR_MM)
-    values: dict[str, float | str | None] = {
-        "part": name,
-        "miss_mm": bound_mm,
-        "limit_mm": POOR_MM,
-        "digits": digits,
-    }
-    return Finding("miss", values)
+    about: dict[str, float | str | None] = {"part": name, "digits": _telling(bound_mm, POOR_MM)}
+    return Finding("miss", {**about, "miss_mm": bound_mm, "limit_mm": POOR_MM})
 
 
 def _contradiction(evidence: Sequence[EvidenceReport]) -> Finding | None:
@@ -242,105 +224,53 @@ def _unsure(report: FitReport) -> Finding | None:
     return None
 
 
-def _tilt_finding(tilt_degrees: float) -> Kind:
-    """``tilt_degrees``: of the other pose in which the organ fits."""
-    if tilt_degrees > _UPSIDE_DOWN:
-        return "upside_down"
-    return "tilted" if tilt_degrees > _FAR_TILTED else "not_turned"
+@dataclass
+class _Dispute:
+    name: str
+    off_mm: float
+    part: str
+    vertex: int  # of the part's surface, where the answer has it instead
+    against: int = 0
 
 
-def _behind_mm(look: Look) -> float:
-    """What lies so far behind the estimated surface is behind the organ, and no noise of it."""
-    measured_mm = 0.0 if look.cloud.noise is None else look.cloud.noise.measured_mm
-    return float(np.hypot(_THROUGH_MM, _NOISES * measured_mm))
+class Disputes:
+    """What contradicted an answer of one tracked organ speaks against the next ones too, until it
+    is acknowledged. Vertices move with the tissue, so places need no motion."""
+
+    def __init__(self) -> None:
+        self._open: list[_Dispute] = []
+
+    def acknowledge(self) -> None:
+        """The user has seen them all."""
+        self._open = []
+
+    def update(self, estimate: Estimate) -> Finding | None:
+        """With the next answer: what still speaks against it."""
+        lasting = [e for e in estimate.report.evidence if e.name not in _OF_A_MOMENT]
+        new = [each for each in lasting if not each.before]
+        for dispute in self._open:
+            there_mm = _surface(estimate, dispute.part)[dispute.vertex]
+            agree = (each for each in new if not each.left_out)
+            dispute.against += sum(_nearest(each, there_mm[None])[0] <= _THERE_MM for each in agree)
+        self._open = [one for one in self._open if one.against < _OUTVOTED]
+        old = [each for each in lasting if each.before]
+        wrong = sum(each.left_out for each in old) > len(old) / 2  # rather the answer than they
+        for each in (*new, *(old if wrong else ())):
+            if each.left_out:
+                vertex = _nearest(each, _surface(estimate, each.part))[1]
+                self._open.append(_Dispute(each.name, each.off_mm, each.part, vertex))
+        if not self._open:
+            return None
+        last = self._open[-1]
+        return Finding("disputed", {"name": last.name, "off_mm": last.off_mm})
 
 
-def seen_through(
-    organ: Mesh, frame: DepthFrame, behind_mm: float = _THROUGH_MM
-) -> tuple[float, float, float]:
-    """Three shares of the estimated organ's image, all 0 if no pixel has a return there.
-
-    1. Where the camera sees something behind the surface, such as a table, which the organ would
-       hide; of the pixels with a return.
-    2. Of a rim round the image: where something lies behind the organ's nearest point. A wrong
-       organ reaches beyond the true one, and is seen through if something can be seen there.
-    3. Where nothing hides the organ.
-    """
-    seen_mm, organ_mm = _compared(organ, frame)
-    image = np.isfinite(organ_mm)
-    both = image & np.isfinite(seen_mm)
-    if not both.any():
-        return 0.0, 0.0, 0.0
-    in_sight = (seen_mm[both] > organ_mm[both] - behind_mm).sum() / image.sum()
-    rim = _within(_RIM, image) & ~image
-    rim_share = (seen_mm[rim] > organ_mm[image].min()).sum() / max(rim.sum(), 1)
-    through = (seen_mm[both] > organ_mm[both] + behind_mm).mean()
-    return float(through), float(rim_share), float(in_sight)
+def _surface(estimate: Estimate, part: str) -> np.ndarray:
+    meshes = {**estimate.meshes, **estimate.structures}
+    return meshes.get(part, estimate.organ_mesh).vertices_mm
 
 
-def explained(organ: Mesh, look: Look) -> float:
-    """Log-likelihood of a look's depth image with the organ there, but for a constant and a factor:
-    each pixel that shows its surface speaks for it, each that shows what it would hide against."""
-    assert isinstance(look.seen, DepthFrame)
-    seen_mm, organ_mm = _compared(organ, look.seen)
-    off_mm, behind_mm = seen_mm - organ_mm, _behind_mm(look)  # NaN where one shows nothing
-    on, through = np.abs(off_mm) < _ON * behind_mm, off_mm > behind_mm
-    return float(on.sum() - _AGAINST * through.sum())
-
-
-def _compared(organ: Mesh, frame: DepthFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Depths that were seen, and the organ's, in a smaller image."""
-    every = max(1, round(frame.intrinsics.width / _WIDTH))
-    seen_mm = frame.depth_mm[::every, ::every]
-    full = frame.intrinsics
-    scaled = (number / every for number in (full.fx, full.fy, full.cx, full.cy))
-    reduced = Intrinsics(*seen_mm.shape[::-1], *scaled)
-    return seen_mm, render_depth(organ.vertices_mm, organ.faces, reduced).depth_mm
-
-
-def cloud_shares(
-    organ: Mesh, cloud: SensorCloud, behind_mm: float = _THROUGH_MM
-) -> tuple[float, float]:
-    """Of a cloud, whose camera is at its origin: the share of the points in the organ's image that
-    lie behind its surface, and the share of the image without points."""
-    nearest_mm = organ.vertices_mm[:, 2].min()
-    if nearest_mm <= _PIXEL_MM:  # round the camera
-        return 0.0, 1.0
-    focal = nearest_mm / _PIXEL_MM
-    outline = focal * organ.vertices_mm[:, :2] / organ.vertices_mm[:, 2:]
-    low, high = np.floor(outline.min(0)), np.ceil(outline.max(0))
-    width, height = (int(n) for n in high - low + 1)
-    if max(width, height) > _MAX_PIXELS:
-        return 0.0, 1.0
-    camera = Intrinsics(width, height, focal, focal, *(-low).tolist())
-    organ_mm = render_depth(organ.vertices_mm, organ.faces, camera).depth_mm
-    points_mm = cloud.points_mm[:: len(cloud.points_mm) // _MAX_POINTS + 1]
-    points_mm = points_mm[points_mm[:, 2] > 0].astype(np.float64)
-    column, row = np.rint(focal * points_mm[:, :2] / points_mm[:, 2:] - low).astype(int).T
-    within = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    column, row, z_mm = column[within], row[within], points_mm[within, 2]
-    surface_mm = organ_mm[row, column]
-    on = np.isfinite(surface_mm)
-    if not on.any():
-        return 0.0, 1.0
-    through = float((z_mm[on] > surface_mm[on] + behind_mm).mean())
-    filled = np.zeros(organ_mm.shape, bool)
-    filled[row, column] = True
-    image = np.isfinite(organ_mm)
-    spacing = np.sqrt(image.sum() / on.sum())  # pixels between neighbouring points
-    near = _within(max(_SEEN_WITHIN_MM / _PIXEL_MM, 2 * spacing), filled)
-    return through, float(1 - near[image].mean())
-
-
-def _within(reach: float, filled: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-    """Pixels with a filled one within so many pixels' distance, by sums along rows (SciPy's
-    distance transform is slow to import, which would delay the first verdict)."""
-    pad, (height, width) = int(min(reach, np.hypot(*filled.shape))), filled.shape
-    sums = np.cumsum(np.pad(filled, ((pad, pad), (pad + 1, pad))), axis=1)
-    near = np.zeros(filled.shape, bool)
-    for down in range(-pad, pad + 1):
-        across = min(int(np.sqrt(reach**2 - down**2)), pad)
-        rows = sums[pad + down : pad + down + height]
-        ends = rows[:, pad + across + 1 :][:, :width]
-        near |= ends > rows[:, pad - across : pad - across + width]
-    return near
+def _nearest(piece: EvidenceReport, surface_mm: np.ndarray) -> tuple[float, int]:
+    """The least distance of its places from these, and of which."""
+    away_mm = np.linalg.norm(np.array(piece.places_mm)[:, None] - surface_mm, axis=2)
+    return float(away_mm.min()), int(away_mm.min(0).argmin())

@@ -23,10 +23,8 @@ Distances = Float[np.ndarray, " n"]
 _SHARE = 80  # per cent of the points that must fit: a tenth may be background
 _PER_MEDIAN = 1.90  # of four fifths, the distance per that of half, if errors are normal
 
-# Validation scenes hold noise, background and deformation, yet not all that occurs.
-# Organs dragged by 20 mm or stretched by 30 %, which training never shows, lie within 1.0 (a model
-# of 10,000 steps) to 1.7 times (of 1,500) the validation's fit; tables, cubes and balls of any
-# size but the organ's own lie 3 to 20 times as far.
+# What these limits rest on: docs/decisions/034-limits.md. Validation scenes hold noise, background
+# and deformation, yet not all that occurs: so many times their fit is allowed.
 FIT_FACTOR = 2.0
 _SMALLEST_LIMIT_MM = 4.0  # a depth camera's own errors may exceed those of clean training scenes
 _SPREAD_FACTOR = 1.5
@@ -35,9 +33,7 @@ _SPREAD_FACTOR = 1.5
 # hundredth of the best one's.
 RIVAL_COST = -2 * math.log(0.01)
 
-# An elastic state's squared Mahalanobis distance is 1 on average over its library. Fits of the
-# digital twin's worst states have 0.4, of the paper's drags, which no library holds, up to 0.9;
-# flat tables of the organ's size, to which it can be bent, 1.4 to 2.4.
+# An elastic state's squared Mahalanobis distance is 1 on average over its library.
 _LARGEST_MAHALANOBIS_2 = 1.25
 
 

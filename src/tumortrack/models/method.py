@@ -1,13 +1,10 @@
 """The interface of methods beside the default one, which installed packages add.
 
-A package names an object with the interface ``Method`` in its pyproject.toml:
+A package names an object with the interface ``Method`` in its pyproject.toml, which is loaded only
+when a preset, configuration or model folder is not of the default method:
 
     [project.entry-points."tumortrack.methods"]
     occupancy = "tumortrack_occupancy.method:METHOD"
-
-It also defines a ``ModelConfig``, a ``Model`` and a ``Locator``. The object is loaded only when a
-preset, configuration or model folder is not of the default method; its module should import
-nothing slow.
 """
 
 from __future__ import annotations
@@ -121,12 +118,8 @@ def method_of_preset(preset: str) -> Method:
 
 
 def method_of_config(config: ModelConfig) -> Method:
-    """The method of a configuration.
-
-    Raises:
-        PackageError: no method is installed, or one that may be the right one is broken.
-        InputError: it is of none of the installed methods.
-    """
+    """The method of a configuration. Raises PackageError: no method is installed, or one that may
+    be the right one is broken; InputError: it is of none of the installed methods."""
     name = type(config).__name__
     return _installed(f"the configuration {name}", lambda method: method.has_config(config))
 

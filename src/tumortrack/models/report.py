@@ -1,4 +1,4 @@
-"""What every kind of locator does with a frame, and what all of them report."""
+"""What locators of all kinds do with a cloud, and what all of them report."""
 
 from __future__ import annotations
 
@@ -47,19 +47,16 @@ class Frame:
         self.model.synchronise()
         self.seconds[name] = time.perf_counter() - start
 
-    def report(
-        self, distances_mm: Float[np.ndarray, " n"], parts: dict[str, PartReport], **more: Any
-    ) -> FitReport:
-        """``distances_mm``: of the observed points from the estimated surface."""
-        median, p95 = np.percentile(distances_mm, (50, 95)).tolist()
-        return FitReport(
-            seed=self.seed,
-            points=len(self.cloud.points_mm),
-            fit_mm=Residuals(median=median, p95=p95),
-            parts=parts,
-            timings={**self.seconds, "total": sum(self.seconds.values())},
-            **more,
-        )
+    @property
+    def timings(self) -> dict[str, float]:
+        """Seconds by stage, and of all."""
+        return {**self.seconds, "total": sum(self.seconds.values())}
+
+
+def residuals(distances_mm: Float[np.ndarray, " n"]) -> Residuals:
+    """Of the observed points, by their distances from the estimated surface."""
+    median, p95 = np.percentile(distances_mm, (50, 95)).tolist()
+    return Residuals(median=median, p95=p95)
 
 
 def grid_over(points_mm: np.ndarray, grid: int) -> tuple[Affine, tuple[int, int, int]]:

@@ -7,7 +7,7 @@ has it stays so.
 
 The choice is made on groups of neighbouring points, whose distances are taken to be linear in the
 unknowns. Then follow true steps, in which evidence is true or false (a mixture). Neighbours share
-errors of the model (``model_error``). The curvature is the precision of the answer: far from what
+errors of the model (``rest_shape``). The curvature is the precision of the answer: far from what
 is seen the compliance says by how much the organ may be elsewhere.
 """
 
@@ -25,17 +25,15 @@ from tumortrack.native import F64, kernel
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.evidence import Terms
 from tumortrack.registration.gauss_newton import RegistrationResult, prior_precision
-from tumortrack.registration.kernels import POSE
 from tumortrack.registration.looks import Looks, Residuals
-from tumortrack.registration.model_error import covariance_mm2
-from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.motion import POSE, ElasticMotion
+from tumortrack.registration.rest_shape import error_covariance_mm2
 from tumortrack.sense.noise import CAMERA_STD
 
-# Of the coefficients: hardly any; as loads like the library's would have them; strong ones. Five
-# values from 0.5 to 8 choose no better.
+# Of the coefficients: hardly any; as loads like the library's would have them; strong ones.
 _STDS_MM = (0.5, 2.0, 6.0)
-# What fits leave of groups of points where the model errs as ``sigma_mm`` and ``model_error`` say;
-# where less or more is left, it errs by less or more: in scenes of two kinds of physics 0.1 to 0.4.
+# What fits leave of groups of points where the model errs as ``sigma_mm`` and ``ModelError`` say;
+# where less or more is left, it errs by less or more.
 _USUAL_MISFIT_MM, _SCALES = 0.3, (0.32, 0.8)
 _FAR_OFF, _FAR_MM = 3.0, 0.3  # medians, and mm: groups farther off are none of the organ
 # Of coefficients that the points tell no better than by so much; as the library's loads have them.
@@ -46,6 +44,7 @@ _SPREADS = (0.3, 1.0, 2.0)
 _LINEAR_STEPS = 2
 _GROUPS = 64  # of neighbouring points, some 8 mm apart
 _ALIKE_MM = 1.0  # points farther from their group's median count little in its mean
+_LESS = 0.05  # share of the prior's weight: first order, and no float32 noise
 _JUDGED_WIDTH = 2.0  # neighbours that lie off together are rather the organ than strays
 
 
@@ -63,6 +62,16 @@ class BentFit:
     misfit_mm: float
     prior_slope: Float64[np.ndarray, " p"]
     terms: Terms | None
+
+    @property
+    def held_by_prior_mm(self) -> list[float]:
+        """How far the prior, against the points, holds the middle of each part: to first order, how
+        far each moves per share of the prior's weight taken away."""
+        motion, middles_ct = self.motion, self.motion.shape.middles_ct
+        assert motion.covariance is not None
+        freer = motion.changed(_LESS * motion.covariance @ self.prior_slope)
+        away_mm = freer.carry(middles_ct) - motion.carry(middles_ct)
+        return (np.linalg.norm(away_mm, axis=1) / _LESS).tolist()
 
 
 def bend(fit: RegistrationResult, config: GaussNewtonConfig) -> BentFit:
@@ -259,7 +268,7 @@ class _Groups:
             weights = np.append(weights, terms.std_mm**-2.0)
             width_mm = np.append(width_mm, terms.width_mm)
         shared = np.zeros((len(means), len(means)))
-        shared[: len(counts), : len(counts)] = scale**2 * covariance_mm2(of_groups.middles_ct)
+        shared[: len(counts), : len(counts)] = scale**2 * error_covariance_mm2(of_groups.middles_ct)
         if terms is not None:
             shared[len(counts) :, len(counts) :] = terms.by_shifts @ terms.by_shifts.T
         by_library, by_compliance, distances_mm = np.split(means, [POSE + len(body.mean), -1], 1)
@@ -285,7 +294,7 @@ class _Groups:
         squares = np.average(np.tile(np.square(_SPREADS), (len(costs), 1)), weights=shares)
         return _STDS_MM[int(costs.min(1).argmin())], float(np.sqrt(squares))
 
-    def cost(self, std_mm: float, spread: float = 1.0) -> float:
+    def cost(self, std_mm: float, spread: float = 1.0, steps: int = _LINEAR_STEPS) -> float:
         """-2 log of the evidence of the compliance's deviation and the library's spread, up to a
         constant.
 
@@ -295,7 +304,7 @@ class _Groups:
         explained += std_mm**2 * self.by_compliance_mm2
         given = self.weights, self.at_mean_mm, self.distances_mm, self.width_mm
         room = np.empty_like(explained), np.empty((3, len(explained)))
-        cost = float(_linear_cost(explained, *given, _JUDGED_WIDTH, _LINEAR_STEPS, *room))
+        cost = float(_linear_cost(explained, *given, _JUDGED_WIDTH, steps, *room))
         if not math.isfinite(cost):
             raise np.linalg.LinAlgError("the evidence of a compliance cannot be told")
         return cost

@@ -14,7 +14,6 @@ from tumortrack.simulate.deform import ElasticConfig
 from tumortrack.simulate.scene import PoseConfig, SceneConfig
 
 Rotations = Literal["full", "limited"]
-TILT_DEGREES = 30.0  # about either axis across the line of sight
 
 
 class GaussNewtonConfig(Config, frozen=True):
@@ -69,10 +68,10 @@ class RegistrationConfig(ModelConfig, frozen=True):
 
 
 def clinic(
-    anatomy: Anatomy, rotations: Rotations = "limited", tilt_degrees: float = TILT_DEGREES
+    anatomy: Anatomy, rotations: Rotations = "limited", tilt_degrees: float = 30.0
 ) -> RegistrationConfig:
     """The default: an elastic body is registered, and calibrated on scenes with sensor errors,
-    occlusion and background."""
+    occlusion and background. ``tilt_degrees``: about either axis across the line of sight."""
     scene = SceneConfig(
         pose=PoseConfig(rotations=rotations, tilt_deg=tilt_degrees),
         deform=(ElasticConfig(),),

@@ -9,26 +9,70 @@ points with errors and the library of states as a Gaussian prior, minimise
 d being the distance (mm) of a point, carried back to the CT, to the organ's surface, and rho a
 robust kernel: (d / sigma_mm)^2 for small d.
 
-The distance is looked up in a field, so no nearest point is searched. The same curvature is the
-estimate's uncertainty. Source: surface registration as maximum a posteriori with a statistical
-shape prior, e.g. Heimann and Meinzer 2009 (doi 10.1016/j.media.2009.05.004).
+The distance is looked up in a field, so no nearest point is searched; all steps are one call of C
+(``native/fast/gauss_newton.c``). The same curvature is the estimate's uncertainty. Source: surface
+registration as maximum a posteriori with a statistical shape prior, e.g. Heimann and Meinzer 2009
+(doi 10.1016/j.media.2009.05.004).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float64
 
-from tumortrack.registration import gauss_newton_kernels as kernels
+from tumortrack.native import F32, F64, kernel
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.evidence import EvidenceTerms, Terms
 from tumortrack.registration.looks import Looks
-from tumortrack.registration.motion import ElasticMotion
-from tumortrack.registration.rest_shape import RestShape
+from tumortrack.registration.motion import POSE, ElasticMotion
+from tumortrack.registration.rest_shape import DISTANCES, DistanceField, RestShape
+from tumortrack.simulate.elastic.flow import BLOCK, MODES, VELOCITY, LatticeField
 
 FARTHEST = 2.0  # widths of the robust kernel: what lies beyond weighs less than 1/25
+_STRIDE = 256 + 16  # of the columns in native/fast/gauss_newton.c
+
+
+class _Problem(NamedTuple):
+    """The organ at rest and the prior of its motion (CT frame, mm), the observed points (camera
+    frame, mm), and of ``GaussNewtonConfig``; ``weight`` of one point's squared distance."""
+
+    modes: LatticeField
+    center_ct: np.ndarray  # (3,), float64
+    distances: DistanceField
+    precision: np.ndarray  # (p, p), float64
+    mean: np.ndarray  # (m,), float64
+    points: np.ndarray  # (n, 3), float32
+    weight: float
+    first_mm: float
+    last_mm: float
+    narrowing: float
+    enough_mm: float
+
+
+class _State(NamedTuple):
+    """What is refined, and what its last step has left; float64, changed in place."""
+
+    rotation: np.ndarray  # (3, 3)
+    centre_mm: np.ndarray  # (3,)
+    coefficients: np.ndarray  # (m,)
+    moved: np.ndarray  # (6,): shift and turn since the start
+    distances_mm: np.ndarray  # (n,), float32
+    curvature: np.ndarray  # (p, p)
+    gradient: np.ndarray  # (p,)
+
+
+_descend = kernel(  # problem, state, room, first and last step, what it ended with
+    "descend",
+    (MODES, F64[3], DISTANCES, F64["p", "p"], F64["m"], F32["n", 3], *[float] * 5),
+    (F64[3, 3].out, F64[3].out, F64["m"].out, F64[6].out, F32["n"].out, F64["p", "p"].out,
+     F64["p"].out),
+    (VELOCITY.out, F32["m"].out, F32[BLOCK, "q"].out, F32["c", _STRIDE].out, F64["c", "s"].out,
+     F64["p", "p"].out, F64["p"].out),
+    int, int, F64[2].out, result=int,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +88,7 @@ class RegistrationResult:
         moved: shift (mm) and turn (rad) from where the prior has the pose.
         terms: of the evidence, at the motion.
         rivals: other minima that explain the points nearly as well; ``beyond``: one that explains
-            them better, in a pose that is excluded (see ``choose.likeliest``).
+            them better, in a pose that is excluded (see ``registration.likeliest``).
     """
 
     motion: ElasticMotion
@@ -109,7 +153,7 @@ class GaussNewton:
         body, count = rest.body, len(looks.points_mm)
         precision = prior_precision(rest, config)
         self._rest, self._looks, last_mm = rest, looks, looks.width_mm(config)
-        self._problem = kernels.Problem(
+        self._problem = _Problem(
             modes=body.mode_field,
             center_ct=body.center_ct,
             distances=rest.distances[0],
@@ -126,7 +170,7 @@ class GaussNewton:
         rotation, centre_mm, coefficients = (np.array(part, float, order="C") for part in given)
         left = np.empty(count, np.float32), np.empty_like(precision), np.empty(len(precision))
         already = np.zeros(6) if moved is None else np.array(moved, float)
-        self._state = kernels.State(rotation, centre_mm, coefficients, already, *left)
+        self._state = _State(rotation, centre_mm, coefficients, already, *left)
         self.cost, self.steps, self.converged = np.inf, 0, False
         self._terms: Terms | None = None  # of the evidence, at the present state
 
@@ -135,8 +179,7 @@ class GaussNewton:
         if self.converged or (steps <= self.steps and np.isfinite(self.cost)):
             return
         if self._looks.evidence is None:
-            reached = kernels.descend(self._problem, self._state, self.steps, steps)
-            self.steps, self.converged, self.cost = reached
+            self.steps, self.converged, self.cost = self._descend(self.steps, steps)
             return
         if not np.isfinite(self.cost):
             self._step(0, 0)
@@ -147,14 +190,36 @@ class GaussNewton:
     def _step(self, first: int, last: int) -> None:
         """With the evidence in the equations that it leaves."""
         state, evidence = self._state, self._looks.evidence
-        _, self.converged, cost = kernels.descend(self._problem, state, first, last)
+        _, self.converged, cost = self._descend(first, last)
         motion = ElasticMotion(self._rest, state.rotation, state.centre_mm, state.coefficients)
         assert evidence is not None
         self._terms = evidence.at(motion)
         self.cost = cost + self._terms.add_to(state.curvature, state.gradient)
 
+    def _descend(self, first: int, last: int) -> tuple[int, bool, float]:
+        """Steps ``first`` to ``last``, fewer if it converges, in one call of the kernel: their
+        number, whether it has converged, and the last cost. Where ``first`` is not 0, the state is
+        what the steps before have left. Raises numpy.linalg.LinAlgError: the curvature is not
+        positive definite."""
+        mean, ended = self._problem.mean, np.empty(2)
+        unknowns = POSE + len(mean)
+        columns = -(-(unknowns + 1) // 4) * 4
+        room = (
+            np.empty(self._problem.modes.values.shape[:-1], np.float32),
+            np.empty(len(mean), np.float32),
+            np.empty((BLOCK, unknowns + 1), np.float32),
+            np.empty((columns, _STRIDE), np.float32),
+            np.empty((columns, columns + 4)),
+            np.empty((unknowns, unknowns)),
+            np.empty(unknowns),
+        )
+        steps = _descend(self._problem, self._state, room, first, last, ended)
+        if steps < 0:
+            raise np.linalg.LinAlgError("the refinement's curvature is not positive definite")
+        return steps, bool(ended[0]), float(ended[1])
+
     def result(self) -> RegistrationResult:
-        state = kernels.State._make(part.copy() for part in self._state)
+        state = _State._make(part.copy() for part in self._state)
         covariance = np.linalg.inv(state.curvature)
         placed = state.rotation, state.centre_mm, state.coefficients
         motion = ElasticMotion(self._rest, *placed, covariance)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -12,14 +13,44 @@ from jaxtyping import Float32, Float64
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Affine, Points, largest_std_of, rigid, std_of, turned_by
 from tumortrack.core.process import parallel_for
-from tumortrack.registration import kernels
-from tumortrack.registration.kernels import Pose
-from tumortrack.registration.rest_shape import RestShape
-from tumortrack.simulate.elastic.flow import Flow, steps_for
+from tumortrack.native import F32, F64, kernel
+from tumortrack.registration.rest_shape import DISTANCES, DistanceField, RestShape
+from tumortrack.simulate.elastic.flow import FLOW, MODES, Flow, LatticeField, steps_for
 
-Moved = Float64[np.ndarray, "n 3"]
+POSE = 6  # unknowns before the coefficients: shift and turn
 _AT_ONCE = 4096  # points per thread
 _FEW = 1024  # the same, where each takes longer
+
+
+class Pose(NamedTuple):
+    """x -> rotation (x - center_ct) + centre_mm; float64."""
+
+    center_ct: Float64[np.ndarray, " 3"]
+    rotation: Float64[np.ndarray, "3 3"]
+    centre_mm: Float64[np.ndarray, " 3"]
+
+
+# In C: native/fast/motion.c. Derivatives by coefficients are to first order: the modes halfway
+# along a point's path. The opposite flow has the opposite velocity.
+_POSE, _POINTS = (F64[3], F64[3, 3], F64[3]), F32["n", 3]
+_carry = kernel("carry", FLOW, _POSE, _POINTS, F64["n", 3].out)
+_back = kernel("back", FLOW, _POSE, _POINTS, F64["n", 3].out)  # with the opposite flow
+_effects = kernel("effects", FLOW, MODES, F64[3], _POINTS, F32["m"].out, F64["n", 3, "p"].out)
+_residual_rows = kernel("residual_rows", MODES, DISTANCES, FLOW, _POSE, _POINTS, F32["n", "q"].out)
+
+
+def residual_rows(
+    modes: LatticeField,
+    field: DistanceField,
+    opposite: Flow,
+    pose: Pose,
+    points: Float32[np.ndarray, "n 3"],
+) -> Float32[np.ndarray, "n q"]:
+    """What shift, turn and coefficients each do to the signed distance (mm) of points (camera
+    frame), carried back, to a surface at rest; the distance itself stands in the last column."""
+    out = np.empty((len(points), POSE + modes.values.shape[-1] + 1), np.float32)
+    _residual_rows(modes, field, opposite, pose, points, out)
+    return out
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,21 +89,21 @@ class ElasticMotion:
 
     def changed(self, change: Float64[np.ndarray, " p"]) -> ElasticMotion:
         """With this added to shift, turn and coefficients; still with its covariance."""
-        shift, turn = change[:3], change[3 : kernels.POSE]
+        shift, turn = change[:3], change[3:POSE]
         return replace(
             self,
             rotation=self.rotation @ turned_by(turn),
             centre_mm=self.centre_mm + self.rotation @ shift,
-            coefficients=self.coefficients + change[kernels.POSE :],
+            coefficients=self.coefficients + change[POSE:],
         )
 
-    def carry(self, points_ct: Points, /) -> Moved:
+    def carry(self, points_ct: Points, /) -> Float64[np.ndarray, "n 3"]:
         """CT (LPS, mm) -> camera frame (mm)."""
-        return self._moved(kernels.carry, self._flow, points_ct)
+        return self._moved(_carry, self._flow, points_ct)
 
-    def back(self, points_camera: Points, /) -> Moved:
+    def back(self, points_camera: Points, /) -> Float64[np.ndarray, "n 3"]:
         """Camera frame (mm) -> CT (LPS, mm)."""
-        return self._moved(kernels.back, self._opposite, points_camera)
+        return self._moved(_back, self._opposite, points_camera)
 
     def std_mm(self, points_ct: Points, /) -> Float64[np.ndarray, " n"] | None:
         """One standard deviation along any axis, mm: the root of the mean over three of them."""
@@ -112,16 +143,20 @@ class ElasticMotion:
     def effects(self, points_ct: Points) -> Float64[np.ndarray, "n 3 p"]:
         """What shift, turn and coefficients each do to the place of points, organ's axes."""
         body, points = self.shape.body, np.array(points_ct, np.float32, order="C")
-        return kernels.effects(self._flow, body.mode_field, body.center_ct, points)
+        modes, count = body.mode_field, body.modes.shape[-1]
+        out = np.empty((len(points), 3, POSE + count))
+        _effects(self._flow, modes, body.center_ct, points, np.empty(count, np.float32), out)
+        return out
 
     def residual_rows(self, points_camera: Points, surface: int = 0) -> Float32[np.ndarray, "n q"]:
-        """What shift, turn and coefficients each do to the signed distance (mm) of points, carried
-        back, to a surface at rest (the organ's; see ``RestShape.field``); that distance last."""
-        body, points = self.shape.body, np.array(points_camera, np.float32, order="C")
-        distances = self.shape.field(surface)
-        return kernels.residual_rows(body.mode_field, distances, self._opposite, self._pose, points)
+        """See ``residual_rows``; ``surface``: the organ's, or another of ``RestShape.field``."""
+        points, modes = np.array(points_camera, np.float32, order="C"), self.shape.body.mode_field
+        field = self.shape.field(surface)
+        return residual_rows(modes, field, self._opposite, self._pose, points)
 
-    def _moved(self, kernel: Callable[..., None], flow: Flow, points_mm: Points) -> Moved:
+    def _moved(
+        self, kernel: Callable[..., None], flow: Flow, points_mm: Points
+    ) -> Float64[np.ndarray, "n 3"]:
         points, out, pose = _given(points_mm), np.empty((len(points_mm), 3)), self._pose
         parallel_for(lambda part: kernel(flow, pose, points[part], out[part]), len(out), _AT_ONCE)
         return out

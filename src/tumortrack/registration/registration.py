@@ -6,16 +6,15 @@
    certain: one side leaves the turn about the organ's long axis nearly free, and there are local
    minima on the way.
 3. Correct (`looks`): where there are several cameras, their places and the motion in turns.
-4. Choose (`choose`): the likeliest fit is kept, by its cost and by how the organ may lie, which the
-   case says. Other minima that explain the points nearly as well, and put a tumor elsewhere, are
-   kept as rivals; one that explains them better in a pose that the case excludes makes the answer
-   poor.
+4. Choose (`likeliest`, below): by cost, and by how the organ may lie, which the case says. Other
+   minima that explain the points nearly as well, and put a tumor elsewhere, are kept as rivals; one
+   that explains them better in a pose that the case excludes makes the answer poor.
 5. Verdict (`models.in_distribution`): what cannot be this organ is refused.
 6. Bend (`bend`): what the library's states cannot follow, the body's compliance does; with it, what
    points and evidence leave open.
 
 The result is a motion (`motion`): any point of the CT, carried to the camera's frame and back, with
-its uncertainty. `locator` makes surfaces, labels and a report of it.
+its uncertainty. `estimate` makes surfaces, labels and a report of it.
 """
 
 from __future__ import annotations
@@ -31,12 +30,12 @@ import numpy as np
 
 from tumortrack.core.process import parallel_map
 from tumortrack.models.in_distribution import (
+    RIVAL_COST,
     InDistributionRange,
     check_in_distribution,
     check_likely,
 )
 from tumortrack.registration.bend import BentFit, bend
-from tumortrack.registration.choose import cost_with_prior, likeliest
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import (
     FARTHEST,
@@ -47,20 +46,26 @@ from tumortrack.registration.gauss_newton import (
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.rest_shape import RestShape
-from tumortrack.registration.search import PosePrior, Search, Start, far_from, turned_starts
+from tumortrack.registration.search import (
+    PosePrior,
+    Search,
+    Start,
+    apart_mm,
+    far_from,
+    turned_starts,
+)
 
 Timer = Callable[[str], AbstractContextManager[object]]
 
-# On 840 clouds of four organs (drags, elastic states, the digital twin's) the eventual winner's
-# cost after six steps was at most 2.5 times the least (turned starts: twice). Two thirds of the
-# wrong ways round were above three times.
+# What these limits rest on: docs/decisions/034-limits.md.
 _TRIAL_STEPS = 6
 _MAX_COST_RATIO = 3.0  # to the least cost: starts above are given up
 _TURNED_SHARE = 2 / 3  # of that, for turned starts, which compete with a finished fit
-
 _ROUNDS = 4  # of choosing points and fitting: what lies on the organ is known after two or three
 _SAME_POINTS = 0.01  # share of the points: the fit no longer moves by them
-
+_TURNED_RATIO = 2.0  # of an organ that was turned over the upright fit costs so many times as much
+_WITHIN = 7.81  # 95 % of chi squared with three degrees of freedom
+_SAME_MM = 0.2  # descents that end in one minimum end within some last steps (enough_mm, 0.02)
 _CORRECTIONS = 3  # of cameras and motion in turns: more move nothing by a tenth of a millimetre
 
 
@@ -185,3 +190,60 @@ class Registration:
             fit = refine(self.rest, looks, fit.motion, near)
         costs = fit.cost + looks.cost, fit.cost_without_strays + looks.cost
         return replace(fit, cost=costs[0], cost_without_strays=costs[1])
+
+
+def cost_with_prior(fit: RegistrationResult, prior: PosePrior) -> float:
+    """-2 log of a fit's probability, up to a constant."""
+    return fit.cost + float(prior.cost(fit.motion.rotation))
+
+
+def likeliest(fits: Sequence[RegistrationResult], prior: PosePrior) -> RegistrationResult:
+    """The likeliest of these fits and their others, by cost and prior of the pose.
+
+    Its rivals are those that are less likely by ``RIVAL_COST`` at most and put the middle of a part
+    where neither its covariance nor those of likelier rivals have it; its motion has their shares
+    of the probability, ``exp(-cost / 2)``. ``beyond`` is the best fit in a pose that the case
+    excludes, if it costs less; its share is 0. Of an organ that was turned over it is the best one
+    that is not: only where that costs far more is it sure that it was.
+    """
+    everything = [each for fit in fits for each in (fit, *fit.others)]
+    costs = {id(fit): cost_with_prior(fit, prior) for fit in everything}
+    first, *others = sorted(everything, key=lambda fit: costs[id(fit)])
+    kept = [first]
+    for other in others:
+        if costs[id(other)] - costs[id(first)] > RIVAL_COST:
+            break
+        if all(_is_distinct(other.motion, fit.motion) for fit in kept):
+            kept.append(other)
+    beyond = _better_on_other_side(first, everything, prior)
+    odds = [math.exp((costs[id(first)] - costs[id(fit)]) / 2) for fit in kept]
+    shares = [each / sum(odds) for each in odds]
+    rivals = tuple(zip((fit.motion for fit in kept[1:]), shares[1:], strict=True))
+    rivals += () if beyond is None else ((beyond.motion, 0.0),)
+    motion = replace(first.motion, rivals=rivals)
+    return replace(first, motion=motion, rivals=tuple(kept[1:]), beyond=beyond)
+
+
+def _better_on_other_side(
+    first: RegistrationResult, fits: Sequence[RegistrationResult], prior: PosePrior
+) -> RegistrationResult | None:
+    """The best fit with the other side up, if it speaks against the side that ``first`` has up."""
+    stated = prior.as_stated
+    turned = bool(stated.excludes(first.motion.rotation))
+    others = [fit for fit in fits if stated.excludes(fit.motion.rotation) != turned]
+    best = min(others, key=lambda fit: fit.cost, default=None)
+    most = first.cost * (_TURNED_RATIO if turned else 1.0)
+    return best if best is not None and best.cost < most else None
+
+
+def _is_distinct(other: ElasticMotion, motion: ElasticMotion) -> bool:
+    """Whether a part's middle lies outside the ellipsoid of 95 % of the other's covariance."""
+    bent = np.abs(other.coefficients - motion.coefficients).max()
+    if max(bent, apart_mm(other, motion)) < _SAME_MM:
+        return False  # most are the same minimum, which is quickly found
+    middles = motion.shape.middles_ct
+    covariance = replace(motion, rivals=()).covariance_mm2(middles)
+    assert covariance is not None
+    away = other.carry(middles) - motion.carry(middles)
+    squares = (np.linalg.solve(covariance, away[..., None])[..., 0] * away).sum(1)
+    return bool(squares.max() > _WITHIN)

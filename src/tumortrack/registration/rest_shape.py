@@ -1,20 +1,28 @@
-"""The organ at rest: surfaces, signed distances to them, elastic body."""
+"""The organ at rest: surfaces, signed distances to them, elastic body, and how its surface errs.
+
+Noise belongs to single points. The surface that they are compared with errs too, by segmentation
+and by what the elastic body is not: by a field correlated over centimetres, which points, touches
+and outlines share. It is marginalised: of a smooth misfit so much may be the model's. Source: model
+discrepancy as a Gaussian process, Kennedy and O'Hagan 2001 (doi 10.1111/1467-9868.00294).
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float, Float32, Float64, Int64, UInt8
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import triangles_of
+from tumortrack.core.mesh_kernels import farthest
 from tumortrack.core.mesh_query import signed_distances
 from tumortrack.core.organ import KIDNEY, Organ, check_name
 from tumortrack.core.process import parallel_for
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.registration.kernels import DistanceField, mark
-from tumortrack.registration.model_error import ModelError
+from tumortrack.native import F32, U8, kernel
 from tumortrack.simulate.elastic.body import ElasticBody
 
 _STEPS = 40  # of a distance field, along the part's longest side
@@ -22,6 +30,24 @@ _FINEST_MM, _COARSEST_MM = 0.5, 2.0
 _REACH = 10  # steps around a part; farther out the distance is that of the nearest border
 _AT_ONCE = 4096  # points per thread
 _BODY, _STRUCTURE, _VERTICES = "body.", "structure.", "vertices_mm"
+# Two readers' kidneys differ by 0.5 mm rms, correlated over centimetres (KiTS23).
+_ERROR_MM, _LENGTH_MM = 0.5, 20.0
+_APART = 0.85  # lengths between neighbouring nodes, at most
+_MOST_NODES = 256  # of a large organ: they then lie farther apart
+_RIDGE = 1e-3  # of the variance: keeps the correlations invertible
+
+
+class DistanceField(NamedTuple):
+    """Signed distances (mm, negative inside) to one closed surface on a lattice of the CT frame."""
+
+    values_mm: Float32[np.ndarray, "i j k"]
+    origin_mm: Float32[np.ndarray, " 3"]
+    spacing_mm: float
+
+
+DISTANCES = (F32["x", "y", "z"].any_value, F32[3], float)  # finite, and too large to look each time
+# Gives points inside a label, and lowers each point's margin to its distance from the surface.
+_mark = kernel("mark", DISTANCES, int, F32["n", 3], U8["n"].out, F32["n"].out)
 
 
 def distance_of(mesh: Mesh) -> DistanceField:
@@ -35,6 +61,67 @@ def distance_of(mesh: Mesh) -> DistanceField:
 
 
 _kept_distance_of = lru_cache(maxsize=32)(distance_of)  # of structures, which few touch
+
+
+def distances_of(anatomy_ct: Anatomy) -> tuple[DistanceField, ...]:
+    """One field per part; a second or two."""
+    return tuple(map(distance_of, anatomy_ct.parts))
+
+
+def long_axis_mm(organ: Mesh) -> Float64[np.ndarray, " 3"]:
+    """The longest principal direction of a surface's vertices, as long as the organ; either way."""
+    spread = organ.vertices_mm - organ.vertices_mm.mean(0)
+    axis = np.linalg.svd(spread, full_matrices=False)[2][0]
+    return axis * np.ptp(spread @ axis)
+
+
+@dataclass(frozen=True, eq=False)
+class ModelError:
+    """Nodes on an organ's surface (CT, mm) of the field by which it errs, and the precision of
+    their values."""
+
+    nodes_ct: Float64[np.ndarray, "k 3"]
+    precision: Float64[np.ndarray, "k k"]
+
+    @classmethod
+    def of(cls, organ: Mesh) -> ModelError:
+        """Of an organ in the CT."""
+        area_mm2 = np.linalg.norm(triangles_of(organ.vertices_mm, organ.faces)[1], axis=1).sum() / 2
+        count = int(area_mm2 / (_APART * _LENGTH_MM) ** 2) + 1
+        vertices = organ.vertices_mm
+        chosen = np.empty((1, min(count, _MOST_NODES, len(vertices))), np.int64)
+        farthest(np.ascontiguousarray(vertices.T[None], np.float32), np.zeros(1, np.int64), chosen)
+        nodes_ct = vertices[chosen[0]]
+        ridge = _RIDGE * _ERROR_MM**2 * np.eye(len(nodes_ct))
+        return cls(nodes_ct, np.linalg.inv(error_covariance_mm2(nodes_ct) + ridge))
+
+    def nearest(self, points_ct: Float[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
+        """The number of the node that each point has its error of."""
+        nodes = self.nodes_ct
+        return ((nodes**2).sum(1) / 2 - points_ct @ nodes.T).argmin(1)
+
+    def equations(
+        self,
+        node: Int64[np.ndarray, " n"],
+        rows: Float[np.ndarray, "n q"],
+        weights: Float64[np.ndarray, " n"],
+        scale: float = 1.0,
+    ) -> tuple[Float64[np.ndarray, "k k"], Float64[np.ndarray, "k q"]]:
+        """Of the field, if it is so many times as large, in a Gauss-Newton step: its own curvature,
+        and that with ``rows``, each of the node that errs with it."""
+        count = len(self.nodes_ct)
+        order = np.argsort(node, kind="stable")
+        used, first = np.unique(node[order], return_index=True)
+        across = np.zeros((count, rows.shape[1]))
+        across[used] = np.add.reduceat((rows * weights[:, None])[order], first)
+        own = self.precision / scale**2 + np.diag(np.bincount(node, weights, count))
+        return own, across
+
+
+def error_covariance_mm2(points_ct: Float[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n n"]:
+    """Of the model's error at points on the surface."""
+    squares = ((points_ct[:, None] - points_ct[None]) ** 2).sum(2)
+    return _ERROR_MM**2 * np.exp(-squares / (2 * _LENGTH_MM**2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +144,6 @@ class RestShape:
 
     @cached_property
     def long_axis_mm(self) -> Float64[np.ndarray, " 3"]:
-        """The organ's longest principal direction, as long as the organ."""
         return long_axis_mm(self.anatomy_ct.organ)
 
     @cached_property
@@ -80,7 +166,7 @@ class RestShape:
 
         def mark_part(part: slice) -> None:
             for label, field in enumerate(self.distances, start=1):
-                mark(field, label, points_ct[part], labels[part], margin_mm[part])
+                _mark(field, label, points_ct[part], labels[part], margin_mm[part])
 
         parallel_for(mark_part, len(points_ct), _AT_ONCE)
         return labels, margin_mm
@@ -89,7 +175,7 @@ class RestShape:
         """Of points to a surface (see ``field``), negative inside; right near it."""
         points, inside = points_ct.astype(np.float32), np.zeros(len(points_ct), np.uint8)
         away_mm = np.full(len(points), np.finfo(np.float32).max, np.float32)
-        mark(self.field(surface), 1, points, inside, away_mm)
+        _mark(self.field(surface), 1, points, inside, away_mm)
         return np.where(inside, -away_mm, away_mm).astype(float)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
@@ -107,44 +193,26 @@ class RestShape:
         cls, arrays: dict[str, np.ndarray], n_parts: int, kind: Organ = KIDNEY
     ) -> RestShape:
         """The inverse of ``to_arrays``; InputError for an array that is missing or misshapen."""
+        parts, fields, structures = [], [], {}
         try:
-            body = {k.removeprefix(_BODY): v for k, v in arrays.items() if k.startswith(_BODY)}
-            parts, fields = [], []
             for n in range(n_parts):
-                part = (
-                    arrays[f"{n}.{name}"]
-                    for name in ("vertices_mm", "faces", *DistanceField._fields)
-                )
-                vertices, faces, values, origin, spacing = part
-                parts.append(Mesh(vertices, faces))
-                values = np.ascontiguousarray(values, np.float32)
+                parts.append(Mesh(arrays[f"{n}.{_VERTICES}"], arrays[f"{n}.faces"]))
+                given = [arrays[f"{n}.{name}"] for name in DistanceField._fields]
+                values = np.ascontiguousarray(given[0], np.float32)
                 if values.ndim != 3 or min(values.shape) < 2 or not np.isfinite(values).all():
                     raise InputError(
                         f"the organ's distances {values.shape} are no lattice of finite numbers, "
                         "two at least along each axis; make the model again."
                     )
-                fields.append(DistanceField(values, np.asarray(origin, np.float32), float(spacing)))
-            ends = f".{_VERTICES}"
-            structures = {}
+                origin = np.asarray(given[1], np.float32)
+                fields.append(DistanceField(values, origin, float(given[2])))
             for key in arrays:
-                if key.startswith(_STRUCTURE) and key.endswith(ends):
-                    name = key.removeprefix(_STRUCTURE).removesuffix(ends)
+                if key.startswith(_STRUCTURE) and key.endswith(f".{_VERTICES}"):
+                    name = key.removeprefix(_STRUCTURE).removesuffix(f".{_VERTICES}")
                     check_name(name, "a structure", "--structure")
-                    faces = arrays[f"{_STRUCTURE}{name}.faces"]
-                    structures[name] = Mesh(arrays[key], faces)
+                    structures[name] = Mesh(arrays[key], arrays[f"{_STRUCTURE}{name}.faces"])
         except KeyError as error:
             raise InputError(f"the organ's shape lacks {error}; make the model again.") from error
+        of_body = {k.removeprefix(_BODY): v for k, v in arrays.items() if k.startswith(_BODY)}
         anatomy_ct = Anatomy(tuple(parts), kind, structures)
-        return cls(anatomy_ct, ElasticBody.from_arrays(body), tuple(fields))
-
-
-def long_axis_mm(organ: Mesh) -> Float64[np.ndarray, " 3"]:
-    """The longest principal direction of a surface's vertices, as long as the organ; either way."""
-    spread = organ.vertices_mm - organ.vertices_mm.mean(0)
-    axis = np.linalg.svd(spread, full_matrices=False)[2][0]
-    return axis * np.ptp(spread @ axis)
-
-
-def distances_of(anatomy_ct: Anatomy) -> tuple[DistanceField, ...]:
-    """One field per part; a second or two."""
-    return tuple(map(distance_of, anatomy_ct.parts))
+        return cls(anatomy_ct, ElasticBody.from_arrays(of_body), tuple(fields))

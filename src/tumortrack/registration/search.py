@@ -19,16 +19,15 @@ from jaxtyping import Bool, Float64, Int64
 from tumortrack.core.geometry import Points, rotation_onto, triangles_of, turned_by, unit
 from tumortrack.core.process import parallel_for
 from tumortrack.models.in_distribution import RIVAL_COST
+from tumortrack.native import F32, F64, kernel
 from tumortrack.registration.looks import Looks
-from tumortrack.registration.motion import ElasticMotion
-from tumortrack.registration.rest_shape import RestShape
-from tumortrack.registration.search_kernels import RigidProblem, descend_rigidly
+from tumortrack.registration.motion import POSE, ElasticMotion
+from tumortrack.registration.rest_shape import DISTANCES, RestShape
 
 Rotations = Float64[np.ndarray, "*n 3 3"]
 Centres = Float64[np.ndarray, "s 3"]  # of the organ, camera frame, mm
 _TOWARDS_CAMERA = np.array([0.0, 0.0, -1.0])
-# These numbers are our choice. On 160 clouds of four kidneys more kept starts (14), more shifts and
-# another width to compare by left 11 of 160 more than 5 mm off instead of 12.
+# What these numbers rest on: docs/decisions/034-limits.md.
 # Points of all looks, the robust kernel's widths step by step, and the share of the starts that go
 # on: first all of them on few points, then the better ones on more.
 _STAGES = (
@@ -50,13 +49,17 @@ _KEPT, _KEPT_BEYOND = 8, 2  # of those that the prior allows, and that it exclud
 _AT_ONCE = 16  # starts: a thread's part
 _NEARER_HALF, _REACH = (2, 50), 3.0  # per cent of the points; a domed side reaches thrice as deep
 _VERTICES = 500  # that tell which part of the organ a camera sees
-
 _SOFT_DEGREES = 8.0  # one standard deviation of a tilt beyond those that are allowed
+_TURNED_STDS = 4.5  # standard deviations to both sides
 
-# Standard deviations to both sides. Of 1,200 first looks at a moving phantom, by the training's own
-# physics, some 4 in 100 were 3 to 7 mm off without such starts, 6 with starts at 3 deviations, and
-# none at 4.5 or 6.
-_TURNED_STDS = 4.5
+
+# The organ at rest, points, the robust kernel's width in each step and the one to compare by,
+# damping; as ``gauss_newton`` minimises, without an elastic state and a prior. In C:
+# native/fast/search.c.
+_descend_rigidly = kernel(
+    "descend_rigidly", (DISTANCES, F64[3], F32["n", 3], F64["steps"], float, F64[POSE]),
+    F32[POSE + 1, "n"].out, F64["s", 3, 3].out, F64["s", 3].out, F64["s"].out, result=int,
+)  # fmt: skip
 
 
 class Start(NamedTuple):
@@ -168,21 +171,19 @@ class Search:
         rotations: Rotations,
         centres: Centres,
     ) -> Float64[np.ndarray, " s"]:
-        """Refine poses in place, with a robust kernel of these widths in turn; their costs then."""
-        costs = np.empty(len(rotations))
-        problem = RigidProblem(
-            distances=self.rest.distances[0],
-            center_ct=self.rest.body.center_ct,
-            points=points_mm,
-            widths_mm=widths_mm,
-            last_mm=_COMPARED_MM,
-            damping=_DAMPING,
-        )
-        parallel_for(
-            lambda part: descend_rigidly(problem, rotations[part], centres[part], costs[part]),
-            len(rotations),
-            _AT_ONCE,
-        )
+        """Refine poses in place, with a robust kernel of these widths in turn; their costs then:
+        the mean ``rho`` of the points' distances, by ``_COMPARED_MM``."""
+        rest, costs = self.rest, np.empty(len(rotations))
+        of_rest = rest.distances[0], rest.body.center_ct
+        problem = (*of_rest, points_mm, widths_mm, _COMPARED_MM, _DAMPING)
+
+        def descend_some(part: slice) -> None:
+            columns = np.empty((POSE + 1, len(points_mm)), np.float32)
+            some = rotations[part], centres[part], costs[part]
+            if _descend_rigidly(problem, columns, *some) < len(some[0]):
+                raise np.linalg.LinAlgError("the search's curvature is not positive definite")
+
+        parallel_for(descend_some, len(rotations), _AT_ONCE)
         return costs
 
     @cached_property

@@ -21,9 +21,9 @@ from tumortrack.core.geometry import Affine, rigid, transform_points
 from tumortrack.core.rigid_fit import fit_over_volume, kabsch, matched_vertices
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
 from tumortrack.models.model import Model
-from tumortrack.registration.kernels import POSE, DistanceField, Pose, residual_rows
 from tumortrack.registration.model import RegistrationModel
-from tumortrack.registration.rest_shape import RestShape
+from tumortrack.registration.motion import POSE, Pose, residual_rows
+from tumortrack.registration.rest_shape import DistanceField, RestShape
 from tumortrack.report import metrics
 from tumortrack.report.summary import RIVALS, judged_parts
 from tumortrack.sense.cloud import thin_cloud

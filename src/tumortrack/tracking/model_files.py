@@ -145,7 +145,7 @@ def make_model(
 ) -> RegistrationModel:
     """A model of the default method, by default configured by the case's poses and camera; takes
     some seconds. Raises InputError: ``config`` has deformations that are not elastic."""
-    from tumortrack.registration.build import build_model
+    from tumortrack.registration.model import build_model
 
     config = config or _config_of(case)
     provenance = {

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from tumortrack.assessment.bound import POOR_MM
-from tumortrack.assessment.verdict import explained
+from tumortrack.assessment.sight import log_likelihood
 from tumortrack.core.assessment import deciding
 from tumortrack.core.errors import NoEstimate, NotThisOrgan
 from tumortrack.core.estimate import Estimate
@@ -70,7 +70,7 @@ def _likelihood(found: tuple[Estimate, Sequence[Look]]) -> tuple[bool, float]:
     stray are counted."""
     estimate, (look, *_) = found
     if isinstance(look.seen, DepthFrame):
-        return _sure(estimate), explained(estimate.organ_mesh, look)
+        return _sure(estimate), log_likelihood(estimate.organ_mesh, look)
     cost = estimate.report.fit_cost
     strays = 0.0 if cost is None else cost.strays
     return _sure(estimate), len(look.cloud.points_mm) * (1 - strays)

@@ -13,17 +13,17 @@ import msgspec
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.assessment.advice import TOUCH_MORE, where_to_look
-from tumortrack.assessment.causes import likely_causes, words
-from tumortrack.assessment.disputes import Disputes
-from tumortrack.assessment.verdict import doubt_if_hidden, judged
+from tumortrack.assessment.advice import next_evidence, part_number
+from tumortrack.assessment.causes import causes_of, check_of, explained, words
+from tumortrack.assessment.verdict import Disputes, judged, timed
+from tumortrack.core.assessment import Assessment
 from tumortrack.core.config import Config, check_seed
 from tumortrack.core.errors import InputError, NoEstimate, NotThisOrgan
 from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.evidence import CAMERA, Evidence, touched
 from tumortrack.core.geometry import HERE, Affine, rigid, transform_points
 from tumortrack.core.process import keep_small_blocks
-from tumortrack.core.report import Cause, Finding, Likely
+from tumortrack.core.report import Finding, Likely, NextEvidence
 from tumortrack.core.types import Anatomy, DepthFrame, Look, SensorCloud
 from tumortrack.imaging.case import Case
 from tumortrack.models.folder import weakness_of
@@ -47,11 +47,8 @@ _TURNED_OVER_S = 30.0
 _CAUSES_EVERY_S = 1.0
 # Evidence outlasts a hand before the camera: tissue carries what lies on it, as it is seen again.
 _REMEMBERED_S = 60.0
-_NOTHING_HIDES = 0.9  # of the organ's image is in sight; the rest has no return, as at its edges
 _BEFORE_MM = np.array([0.0, 0.0, 300.0])  # of a camera that there is not
-_NO_CAUSE = (Likely(Cause.VIEW),)
 _FARTHEST_MM = 700.0  # of an organ before a camera on a stand
-_OF_POSES = "none", "poses", "fit", "strays", "seen_through"  # checks that wrong poses fail
 
 
 class Tracker:
@@ -76,7 +73,10 @@ class Tracker:
         keep_small_blocks()
         self.model, self._patient, self._organ = model, model.patient, model.organ
         self._weakness = weakness_of(model.provenance)
-        self._locator = _locator(model, advise)
+        self._locator = _locator(model)
+        if advise and not isinstance(model, RegistrationModel):
+            raise InputError("advice needs a model that knows a motion: give the case itself.")
+        self._advised = part_number(advise, model.parts) if advise else None
 
     @property
     def anatomy_ct(self) -> Anatomy | None:
@@ -149,11 +149,12 @@ class Tracker:
 
         def located(looks: Sequence[Look]) -> Estimate:
             found = self._locator.locate(looks, grid, seed, pieces, any_pose)
-            return self._judged(_with_pieces(found, shown, given), looks, False)
+            found = _with_pieces(found, shown, given)
+            return judged(found, looks, factor=self.model.bound_factor)
 
         with self._explaining_errors(looks, _DEFAULTS, bool(pieces)):
             estimate, looks = likeliest_piece(looks, located)
-        return self._explained(self._with_models_word(estimate), looks, _DEFAULTS)
+        return self._assessed(estimate, looks, _DEFAULTS, whole=True)
 
     def follow(
         self,
@@ -174,57 +175,42 @@ class Tracker:
             how = msgspec.structs.replace(how, evidence=(*how.evidence, *pieces))
 
         def located(looks: Sequence[Look]) -> Estimate:
-            return self._judged(self._locator.follow(looks, last, how), looks, strictly, last)
+            found = self._locator.follow(looks, last, how)
+            return judged(found, looks, strictly, self.model.bound_factor, last)
 
         with self._explaining_errors(looks, how, bool(pieces or (last and last.evidence))):
             estimate, looks = likeliest_piece(looks, located, most=1)  # a frame may not wait
-        return self._explained(self._with_models_word(estimate), looks, how)
+        return self._assessed(estimate, looks, how)
 
-    def _judged(
-        self,
-        estimate: Estimate,
-        looks: Sequence[Look],
-        strictly: bool,
-        last: Estimate | None = None,
+    def _assessed(
+        self, estimate: Estimate, looks: Sequence[Look], how: FollowOptions, whole: bool = False
     ) -> Estimate:
-        start = time.perf_counter()
-        estimate = judged(estimate, looks, strictly, self.model.bound_factor)
-        if last is not None:
-            estimate = doubt_if_hidden(estimate, last)
-        return _timed(estimate, "judge", start)
-
-    def _with_models_word(self, estimate: Estimate) -> Estimate:
-        """The estimate with what the model says: its weakness, whose it is."""
-        start = time.perf_counter()
+        """The estimate with whose it is, the causes if it is poor, and what to learn next.
+        ``whole``: of a cloud alone, and no frame of many."""
+        start_s, report, assessment = time.perf_counter(), estimate.report, estimate.assessment
+        finding, causes, advice = assessment.finding, tuple[Likely, ...](), ""
         if self._weakness:
-            estimate = estimate.assessed(finding=Finding("model", {"words": self._weakness}))
-        estimate = replace(estimate, patient=self._patient, organ=self._organ)
-        return _timed(estimate, "judge", start)
-
-    def _explained(self, estimate: Estimate, looks: Sequence[Look], how: FollowOptions) -> Estimate:
-        """A poor estimate with its likely causes and advice."""
-        start = time.perf_counter()
-        if estimate.finding is not None and not self._weakness:
-            causes = self._causes(looks, how, estimate)
-            alone = isinstance(looks[0].seen, SensorCloud) and not len(looks[0].seen.points_mm)
-            # Touches hide nothing, and no camera can look elsewhere.
-            in_sight = estimate.report.in_sight
-            hides = not alone and (in_sight is None or in_sight < _NOTHING_HIDES)
-            if not hides:
-                causes = tuple(c for c in causes if c.cause is not Cause.HIDDEN) or _NO_CAUSE
-            view = TOUCH_MORE if alone else where_to_look(estimate, looks, hides)
-            advice = words(causes, view)
-            estimate = estimate.assessed(causes=causes, advice=advice)
-        return _timed(estimate, "explain", start)
-
-    def _causes(
-        self, looks: Sequence[Look], how: FollowOptions, estimate: Estimate | None
-    ) -> tuple[Likely, ...]:
-        check, wrong = _check_of(estimate), _wrong_evidence(estimate)
-        if len(looks) > 1 and check in _OF_POSES:
-            return (Likely(Cause.POSES),)
-        known = tuple(c for c in how.known.get(check, ()) if c.cause is not Cause.EVIDENCE)
-        return *wrong, *(known or likely_causes(self.model, looks[0].cloud, estimate))
+            finding = Finding("model", {"words": self._weakness})
+        elif finding is not None:
+            causes, advice = explained(self.model, looks, estimate, how.known)
+        pays = tuple[NextEvidence, ...]()
+        if isinstance(self.model, RegistrationModel) and (whole or how.thorough):
+            config = self.model.config.refine
+            pays = next_evidence(estimate, self._advised, config, touches_only=not whole)
+        return replace(
+            estimate,
+            assessment=Assessment(
+                bounds=assessment.bounds,
+                factor=assessment.factor,
+                finding=finding,
+                causes=causes,
+                advice=advice,
+                next_evidence=pays,
+            ),
+            report=msgspec.structs.replace(report, timings=timed(report, "explain", start_s)),
+            patient=self._patient,
+            organ=self._organ,
+        )
 
     @contextmanager
     def _explaining_errors(
@@ -234,7 +220,7 @@ class Tracker:
         try:
             yield
         except NotThisOrgan as error:
-            causes = self._causes(looks, how, None)
+            causes = causes_of(self.model, looks, None, how.known)
             advice = f"{words(causes, '')}."
             if touched:
                 advice += " Or its evidence is of another place: try without it."
@@ -328,39 +314,15 @@ def _cleaned(look: Look) -> Look:
     return replace(look, cloud=cloud, seen=cloud if look.seen is look.cloud else look.seen)
 
 
-def _wrong_evidence(estimate: Estimate | None) -> tuple[Likely, ...]:
-    """The piece of evidence, by its number, that lies the farthest from where the rest has it."""
-    pieces = () if estimate is None else estimate.report.evidence
-    out = [(each.off_mm, number) for number, each in enumerate(pieces, 1) if each.left_out]
-    return (Likely(Cause.EVIDENCE, max(out)[1]),) if out else ()
-
-
-def _locator(model: Model, advise: str) -> Locator:
+def _locator(model: Model) -> Locator:
     if isinstance(model, RegistrationModel):
-        return RegistrationLocator(model, advise)
-    if advise:
-        raise InputError("advice needs a model that knows a motion: give the case itself.")
+        return RegistrationLocator(model)
     return method_of_config(model.config).locator(model)
 
 
 def _unusual(estimate: Estimate) -> bool:
     cost = estimate.report.fit_cost
     return cost is not None and cost.now > cost.usual
-
-
-def _timed(estimate: Estimate, stage: str, start_s: float) -> Estimate:
-    """The estimate with the duration of a stage in its report."""
-    took_s, timings = time.perf_counter() - start_s, estimate.report.timings
-    total_s = timings["total"] + took_s
-    all_s = took_s + timings.get(stage, 0.0)
-    return estimate.reporting(timings={**timings, stage: all_s, "total": total_s})
-
-
-def _check_of(estimate: Estimate | None) -> str:
-    """The check that it failed; ``none`` without an estimate."""
-    if estimate is None:
-        return "none"
-    return "" if estimate.finding is None else estimate.finding.check
 
 
 class FollowerConfig(Config, frozen=True, kw_only=True):
@@ -462,7 +424,7 @@ class Follower:
             raise
         self._known, self._known_ns = self._last.evidence, cloud.stamp_ns
         if causes := self._last.causes:
-            self._causes = {**self._causes, _check_of(self._last): causes}
+            self._causes = {**self._causes, check_of(self._last): causes}
         if self._last.quality == "good":
             self._good_ns = cloud.stamp_ns
         return self._disputed(self._last)

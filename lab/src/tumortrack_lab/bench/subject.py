@@ -14,9 +14,8 @@ from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.imaging.surface import surfaces
 from tumortrack.models.folder import save_model
 from tumortrack.phantom.digital import PhantomParameters, phantom_labels
-from tumortrack.registration.build import build_model
 from tumortrack.registration.config import clinic
-from tumortrack.registration.model import RegistrationModel
+from tumortrack.registration.model import RegistrationModel, build_model
 from tumortrack.sense.cloud import thin_cloud
 from tumortrack.simulate.deform import DragConfig
 from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator

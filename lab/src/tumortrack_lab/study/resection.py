@@ -25,7 +25,7 @@ from tumortrack.core.errors import InputError, NoEstimate, NoPlan
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, OccupancyCloud
-from tumortrack.registration.locator import QUERIES
+from tumortrack.registration.estimate import QUERIES
 from tumortrack.simulate.scene_folder import Scene, read_scene
 from tumortrack.tracking.bound_factor import NAME
 from tumortrack.tracking.fingerprint import fingerprint

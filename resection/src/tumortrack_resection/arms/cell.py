@@ -14,10 +14,10 @@ import numpy as np
 import pinocchio as pin
 from jaxtyping import Float64
 
+from tumortrack.assessment.advice import Place
 from tumortrack.core.errors import NoPlan
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import RigidShape
-from tumortrack.registration.advice import Place
 from tumortrack_resection.arms import body
 from tumortrack_resection.arms.config import CellConfig
 from tumortrack_resection.arms.kinematics import (

@@ -1,4 +1,4 @@
-// See ``registration.kernels``.
+// See registration/estimate.py.
 #include "native.h"
 
 // Of normal errors below margins (n,), 0 or more. ``per_std[which]`` is one over a point's standard

@@ -1,4 +1,4 @@
-// See ``registration.kernels``.
+// See registration/motion.py.
 #include "fast/motion.h"
 
 struct carry {

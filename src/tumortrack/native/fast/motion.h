@@ -1,4 +1,4 @@
-// A motion and an organ at rest; see ``registration.kernels``.
+// A motion and an organ at rest; see registration/motion.py and rest_shape.py.
 #pragma once
 
 #include "fast/flow.h"
