@@ -24,7 +24,7 @@ COMPILER = $(BIN)/python tools/build_backend.py --compiler >/dev/null 2>&1 || { 
 NO_COMPILER = $(BIN)/pip uninstall --quiet --yes ziglang 2>/dev/null
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian clients demo demo-scenes test quick pythons pytest test-hard check attack fuzz crash replay fingerprint figures bench soak wheel lock licences audit results real world sequences plans pull pulls bounds evidence noise rehearsal population site pictures clean
+.PHONY: help setup debian clients demo demo-scenes test quick pythons pytest test-hard check attack replay fingerprint figures bench soak wheel lock licences audit results real world sequences plans pull pulls bounds evidence noise rehearsal population site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -104,14 +104,8 @@ pythons:  ## a fresh clone with every Python here: install, short demo, doctor, 
 pytest: setup  ## all tests, without the checks (ARGS=tests: the tracker's)
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 4 --dist loadfile --no-loadscope-reorder $(ARGS)
 
-attack: setup  ## hostile files and calls: each must end in one clear line (3 minutes; ARGS=NAME ...: these)
-	$(BIN)/python tests/support/attacks.py runs/attacks $(ARGS)
-
-fuzz: setup  ## a million damaged inputs over all readers (20 minutes; ARGS="--inputs 60000 --target NAME")
-	$(BIN)/python tests/support/fuzz.py --artifacts $(ARGS)
-
-crash: setup  ## kill -9 and Ctrl-C at random moments, shortages, two at once (ARGS="--times 20 --only NAME ...")
-	$(BIN)/python tests/support/crashes.py runs/crashes $(ARGS)
+attack: setup  ## hostile and damaged files for every reader, commands killed, short of something, two at once (an hour; ARGS="--attack 3 -k plans")
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 tests/hostile --attack 10 $(ARGS)
 
 replay: setup  ## has any of 500 answers changed since runs/replay.json, by how many mm? Without that file: record them
 	$(BIN)/python tools/replay.py compare

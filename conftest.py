@@ -45,7 +45,7 @@ SLOWEST = (
     "test_locate.py",
     "test_demo.py",
     "test_training.py",
-    "test_endurance.py",
+    "test_killed.py",
     "test_real_patients.py",
     "test_examples.py",
     "test_howto.py",
@@ -55,14 +55,25 @@ SLOWEST = (
     "test_track.py",
     "test_track_devices.py",
     "test_wheel.py",
-    "test_attacks.py",
+    "test_hostile_volumes.py",
     "test_margins.py",
     "test_twin_physics.py",
 )
 
 
+def pytest_addoption(parser):
+    help_ = "also what takes long: hostile files, TIMES kills of each command, more damaged files"
+    parser.addoption("--attack", type=int, default=0, metavar="TIMES", help=help_)
+
+
+def pytest_configure(config):
+    config.addinivalue_line("markers", "attack: is run with --attack alone")
+
+
 @pytest.hookimpl(tryfirst=True)  # before -m chooses
-def pytest_collection_modifyitems(items):
+def pytest_collection_modifyitems(config, items):
+    if not config.getoption("--attack"):
+        items[:] = [item for item in items if not item.get_closest_marker("attack")]
     for item in items:
         if MODELS.intersection(item.fixturenames):
             item.add_marker(pytest.mark.slow)
@@ -179,3 +190,26 @@ def slim_model(once) -> Path:
     from warp_objects import write_slim
 
     return once("slim_model", write_slim)
+
+
+@pytest.fixture(scope="session")
+def attack_base(request, once, phantom_case, clinic_model) -> Path:
+    """What attacks and kills start from: a case, a model, a scene; with --attack also a network, a
+    run and a plan."""
+    from stories import answered, succeeded, tumortrack
+
+    def make(base: Path) -> None:
+        base.mkdir()
+        (base / "model").symlink_to(clinic_model)
+        shutil.copytree(phantom_case, base / "case")
+        shutil.copytree(clinic_model, base / "case" / "model")
+        succeeded(tumortrack("simulate", base / "case", base / "scenes", "--scenes", 1))
+        if not request.config.getoption("--attack"):
+            return
+        (base / "network").symlink_to(request.getfixturevalue("quick_model"))
+        cloud = base / "scenes" / "0000" / "cloud.ply"
+        answered(tumortrack("locate", base / "model", cloud, base / "run"))
+        accepted = ("--accept-poor", "--accept-budget")
+        succeeded(tumortrack("plan", base / "run", base / "plan", *accepted))
+
+    return once("attack_base", make)

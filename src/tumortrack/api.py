@@ -587,8 +587,8 @@ def session(
 ) -> Session:
     """``track``, ready to be opened: for programs that show what happens meanwhile, as the command
     does. ``arms`` act on what is tracked."""
-    from tumortrack.live.session import session
+    from tumortrack.live.session import Session
 
     asked = options_from(TrackOptions, {**options}, "track")
     model = Path(tracker) if isinstance(tracker, str | Path) else tracker
-    return session(model, source, sinks, asked, arms)
+    return Session(model, source, sinks, asked, arms)

@@ -1,7 +1,9 @@
-"""Cameras whose frames a test lists, where they stand, and the loop over them."""
+"""Sources that a test scripts, a tracker that always finds the small organ, and the loop over
+them."""
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -9,18 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from clock import PATIENCE_S
 from live_objects import PARTS, STAMP_NS, small_estimate, small_frame
+from reports import poor
 from tumortrack.core.errors import NoEstimate
-from tumortrack.core.geometry import rigid
+from tumortrack.core.geometry import HERE, rigid
 from tumortrack.live.cameras import Cameras
 from tumortrack.live.loop import Loop, LoopConfig, summary
 from tumortrack.live.poses import CameraPoses
-from tumortrack.live.values import (
-    Observation,
-    PublishedFrame,
-    SinkContext,
-    SourceEnded,
-)
-from tumortrack.live.workers import SourceWorker
+from tumortrack.live.values import Observation, PublishedFrame, SinkContext, SourceEnded
+from tumortrack.live.workers import SinkWorker, SourceWorker
 from tumortrack.sense.region import RegionConfig
 from tumortrack.tracking.tracker import Tracker
 
@@ -31,12 +29,14 @@ BASE = rigid(Rotation.from_euler("x", 170, degrees=True).as_matrix(), np.array([
 
 
 class Tape:
-    """A source that waits for its reader: frames at these milliseconds, errors, things to do."""
+    """A source of frames at these milliseconds, observations, errors, things to do. ``lossless``:
+    it waits for its reader."""
 
-    host_clock, lossless, on_demand, dropped = False, True, True, 0
+    dropped = 0
 
-    def __init__(self, *items, of=0.0):
-        self._left, self._of = list(items), of
+    def __init__(self, *items, of=0.0, lossless=True, host_clock=False, on_demand=True):
+        self._left, self._of, self.closed = list(items), of, 0
+        self.lossless, self.host_clock, self.on_demand = lossless, host_clock, on_demand
 
     def read(self, timeout_s):
         while self._left and callable(self._left[0]):
@@ -46,55 +46,88 @@ class Tape:
         item = self._left.pop(0)
         if isinstance(item, Exception):
             raise item
-        return seen_at(item, self._of)
+        if isinstance(item, int | float):
+            return seen_at(item, self._of)
+        return item if isinstance(item, Observation) else Observation(item, time.time_ns())
 
     def close(self):
-        self._left = []
+        self.closed += 1
 
 
-def seen_at(ms, more_mm=0.0):
+def seen_at(ms, more_mm=0.0, **more):
+    """No two images are alike."""
     frame = small_frame(STAMP_NS + round(ms * MS))
     frame = replace(frame, depth_mm=frame.depth_mm + np.float32(more_mm + ms / 1000))
-    return Observation(frame, frame.stamp_ns)
+    return Observation(frame, frame.stamp_ns, **more)
 
 
 class Located(Tracker):
-    """Finds the small organ before whichever camera, and keeps what it was asked."""
+    """Finds the small organ before whichever camera, and keeps what it was asked. ``verdicts``:
+    good, poor or none, frame after frame."""
 
     anatomy_ct = None
 
-    def __init__(self):  # no model
-        self.asked = []
+    def __init__(self, *verdicts):  # no model
+        self._verdicts, self.asked = list(verdicts), []
 
     def follow(self, cloud, last=None, how=None, seen=None, evidence=()):
         self.asked.append((last, evidence))
+        verdict = self._verdicts.pop(0) if self._verdicts else "good"
+        if verdict == "none":
+            raise NoEstimate("it does not look like this organ")
         estimate = small_estimate(cloud.stamp_ns)
-        return estimate.assessed(finding=None)
+        return estimate.assessed(finding=None if verdict == "good" else poor("it is doubtful"))
 
 
-def played(sources, places, published=None, tracker=None):
+class Notes:
+    """A sink that keeps every result."""
+
+    def __init__(self):
+        self.updates = []
+
+    def publish(self, update):
+        self.updates.append(update)
+
+    def close(self):
+        pass
+
+
+def once(source):
+    """Opens a source; a second time it has ended."""
+    tries = iter([source])
+
+    def opened():
+        if (one := next(tries, None)) is None:
+            raise SourceEnded("not again")
+        return one() if callable(one) else one
+
+    return opened
+
+
+def played(
+    sources, places=(HERE,), published=None, tracker=None, config=None, arms=None, sink=None
+):
     """The loop's results over sources (one try each), and its report."""
-    workers = []
-    for source in sources:
-        tries = iter([source])
-
-        def once(tries=tries):
-            one = next(tries, None)
-            if one is None:
-                raise SourceEnded("not again")
-            return one
-
-        workers.append(SourceWorker(once))
+    tracker = tracker or Located()
     published = published or PublishedFrame("base", places[0], calibrated=True)
-    still = () if hasattr(places, "at") else tuple(places)
-    context = SinkContext(PARTS, published, cameras=still)
-    loop = Loop(tracker or Located(), context, LoopConfig(region=ALL, stale_s=PATIENCE_S / 2))
-    cameras, told = Cameras(workers, places), []
+    context = SinkContext(
+        PARTS,
+        published,
+        tracker.anatomy_ct,
+        cameras=() if hasattr(places, "at") else tuple(places),
+        arms=arms is not None,
+    )
+    config = config or LoopConfig(region=ALL, stale_s=PATIENCE_S / 2)
+    loop, told = Loop(tracker, context, config, arms), []
+    cameras = Cameras([SourceWorker(once(source)) for source in sources], places)
+    outlets = [] if sink is None else [SinkWorker("notes", sink, 1000)]
     try:
-        loop.run(cameras, [], told.append)
-        return told, summary(loop, cameras, [])
+        loop.run(cameras, outlets, told.append)
     finally:
         cameras.close()
+        for outlet in outlets:
+            outlet.close()
+    return told, summary(loop, cameras, outlets)
 
 
 class Led(CameraPoses):

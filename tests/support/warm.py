@@ -9,12 +9,15 @@ import gc
 import importlib
 import json
 import os
+import resource
+import signal
 import subprocess
 import sys
 import tempfile
 import traceback
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 from typing import NoReturn
 
 PRELOADED = (
@@ -44,16 +47,27 @@ def _server() -> subprocess.Popen[str]:
     )
 
 
-def run(arguments: list[str], environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
-    """``tumortrack ARGUMENTS`` to its end."""
+class Done(subprocess.CompletedProcess[str]):
+    """``megabytes``: beyond what the process began with; ``cpu_s``: of all its cores."""
+
+    cpu_s = megabytes = 0.0
+
+
+def run(arguments: list[str], environment: dict[str, str], seconds: int = 0) -> Done:
+    """``tumortrack ARGUMENTS`` to its end; after so many ``seconds`` (0: never) it is killed."""
     server = _server()
     assert server.stdin is not None
     assert server.stdout is not None
-    with tempfile.NamedTemporaryFile("r") as out, tempfile.NamedTemporaryFile("r") as errors:
-        order = [arguments, environment, os.getcwd(), out.name, errors.name]
+    with (
+        tempfile.NamedTemporaryFile("r", errors="replace") as out,
+        tempfile.NamedTemporaryFile("r", errors="replace") as errors,
+    ):
+        order = [arguments, environment, os.getcwd(), out.name, errors.name, seconds]
         print(json.dumps(order), file=server.stdin, flush=True)
-        code = int(server.stdout.readline())
-        return subprocess.CompletedProcess(arguments, code, out.read(), errors.read())
+        code, cpu_s, megabytes = json.loads(server.stdout.readline())
+        done = Done(arguments, code, out.read(), errors.read())
+        done.cpu_s, done.megabytes = cpu_s, megabytes
+        return done
 
 
 def preload() -> None:
@@ -68,14 +82,21 @@ def _serve() -> Callable[[], None]:
     preload()
     while line := sys.stdin.readline():
         if not (pid := os.fork()):
-            arguments, environment, folder, out, errors = json.loads(line)
+            arguments, environment, folder, out, errors, seconds = json.loads(line)
+            signal.alarm(seconds)
+            if seconds:
+                resource.setrlimit(resource.RLIMIT_DATA, (6 * 2**30,) * 2)
             os.environ.clear()
             os.environ.update(environment)
             os.chdir(folder)
             for name, number in ((os.devnull, 0), (out, 1), (errors, 2)):
                 os.dup2(os.open(name, os.O_RDWR | os.O_APPEND), number)
             return lambda: become_command(arguments)
-        print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
+        began_kb = int(Path("/proc/self/statm").read_text().split()[1]) * 4
+        _, status, used = os.wait4(pid, 0)
+        megabytes = (used.ru_maxrss - began_kb) / 1024
+        cpu_s = used.ru_utime + used.ru_stime
+        print(json.dumps([os.waitstatus_to_exitcode(status), cpu_s, megabytes]), flush=True)
     return sys.exit
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,18 +13,18 @@ import pytest
 import trimesh
 
 from motions import CAMERA_FROM_CT, Wave
+from one_way import OneWay
 from reports import report_of
 from tumortrack.cli.locate import Locate
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.estimate import Estimate, Motion
+from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud
 from tumortrack.sense.files import read_cloud
 from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.tracking.files import write_estimate
 from tumortrack.tracking.points import camera_table, check_near_organ, read_points
-from tumortrack_lab.peers.base import OneWay
 
 MIDDLE = np.array([60.0, 40.0, -300.0])
 BOX = np.stack([MIDDLE - 30, MIDDLE + 30])
@@ -68,25 +69,6 @@ def places(rows, frame="camera"):
 def written(path, text):
     path.write_text(text, encoding="utf-8")
     return path
-
-
-# --- motions ---
-
-
-def test_the_tests_own_motion_goes_both_ways_and_bends():
-    points = some_points(50)
-    there = Wave().carry(points)
-    assert isinstance(Wave(), Motion)
-    np.testing.assert_allclose(Wave().back(there), points, atol=1e-9)
-    assert np.linalg.norm(there - transform_points(CAMERA_FROM_CT, points), axis=1).max() > 3
-
-
-def test_one_way_is_a_motion_that_knows_no_way_back():
-    motion = OneWay(Wave().carry)
-    assert isinstance(motion, Motion)
-    np.testing.assert_array_equal(motion.carry(some_points()), Wave().carry(some_points()))
-    assert motion.back(some_points()) is None
-    assert motion.std_mm(some_points()) is None
 
 
 # --- the estimate's folder ---
@@ -153,47 +135,8 @@ def test_an_answer_can_be_asked_again(tmp_path):
     first = camera_table(table, Wave(height_mm=1, sure=True))
     again = read_points(written(tmp_path / "q.csv", first.decode()))
     assert again.columns == table.columns
-    assert "camera_x, camera_y, camera_z, std_mm give way" in again.notes[0]
+    assert len(again.notes) == 1
     assert camera_table(again, Wave(height_mm=3)) == camera_table(table, Wave(height_mm=3))
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("", "has no rows"),
-        ("x,y,z\n", "has no rows"),
-        ("1,2,3\n4,5,6\n", "must name the columns x,y,z"),
-        ("x,y\n1,2\n", "must name the columns x,y,z"),
-        ("x y z\n1 2 3\n", "separated by commas"),
-        ("x,y,z,X\n1,2,3,4\n", "different names"),
-        ("x,y,z\n1,2,3\n1,2\n", "line 3: 2 values in 3 columns"),
-        ("x,y,z\n1,2,3\n1,2,nan\n", "line 3: .* NaN"),
-        ("x,y,z\n1,inf,3\n", "line 2: .*10 km away"),
-        ("x,y,z\n1,1e300,3\n", "line 2: .*10 km away"),
-        ("x,y,z\n1,two,3\n", "line 2, column y: 'two' is no number"),
-        ("x,y,z\n1,,3\n", "line 2"),
-        ('x,y,z\n1,2,"3\n', "line"),
-    ],
-)
-def test_tables_that_are_none_are_refused(tmp_path, text, words):
-    with pytest.raises(InputError, match=words):
-        read_points(written(tmp_path / "p.csv", text))
-
-
-def test_files_that_are_none_are_refused(tmp_path):
-    for name, content, words in (
-        ("p.txt", b"x,y,z\n1,2,3\n", "come as .csv"),
-        ("p.csv", b"x,y,z\n\xff\xfe,2,3\n", "UTF-8"),
-        ("p.fcsv", b"\x80", "UTF-8"),
-        ("p.mrk.json", b"\x80", "no markups file"),
-    ):
-        (tmp_path / name).write_bytes(content)
-        with pytest.raises(InputError, match=words):
-            read_points(tmp_path / name)
-    with pytest.raises(InputError, match="does not exist"):
-        read_points(tmp_path / "none.csv")
-    with pytest.raises(InputError, match="not a regular file"):
-        read_points(tmp_path)
 
 
 # --- 3D Slicer ---
@@ -232,7 +175,8 @@ def test_a_fiducial_may_begin_with_the_sign_of_a_comment(tmp_path):
 def test_fiducials_without_a_place_are_left_out_with_a_note(tmp_path):
     table = read_points(written(tmp_path / "F.fcsv", FCSV.format("LPS", LPS_PLACE, 0)))
     np.testing.assert_array_equal(table.points_ct, [[60.5, 40, -300]])
-    assert "F-2" in table.notes[0]
+    (note,) = table.notes
+    assert "F-2" in note
 
 
 def markups(system="LPS", place=(60.5, 40, -300), **more):
@@ -258,37 +202,48 @@ def test_markups_honour_their_coordinate_system(tmp_path, system, place, units):
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("name", "content"),
     [
-        (markups("IJK"), "system is IJK; it must be LPS or RAS"),
-        (markups(None), "system is missing"),
-        (markups(coordinateUnits="m"), "unit is 'm'"),
-        (markups(place=(1, 2)), r"controlPoints\[0\].position"),
-        (markups(place=("a", 1, 2)), "no markups file"),
-        ({"markups": []}, "holds no points"),
-        ([1], "no markups file"),
-        ({"points": []}, "no markups file"),
+        ("p.csv", ""),
+        ("p.csv", "x,y,z\n"),
+        ("p.csv", "1,2,3\n4,5,6\n"),
+        ("p.csv", "x,y\n1,2\n"),
+        ("p.csv", "x y z\n1 2 3\n"),
+        ("p.csv", "x,y,z,X\n1,2,3,4\n"),
+        ("p.csv", "x,y,z\n1,2,3\n1,2\n"),
+        ("p.csv", "x,y,z\n1,2,3\n1,2,nan\n"),
+        ("p.csv", "x,y,z\n1,1e300,3\n"),
+        ("p.csv", "x,y,z\n1,two,3\n"),
+        ("p.csv", "x,y,z\n1,,3\n"),
+        ("p.csv", 'x,y,z\n1,2,"3\n'),
+        ("p.csv", b"x,y,z\n\xff\xfe,2,3\n"),
+        ("p.txt", "x,y,z\n1,2,3\n"),
+        ("p.fcsv", b"\x80"),
+        ("p.fcsv", FCSV.format("2", LPS_PLACE, 2)),
+        ("p.fcsv", FCSV.replace("# CoordinateSystem = {}\n", "").format(LPS_PLACE, 2)),
+        ("p.fcsv", FCSV.replace("# columns", "# names").format("LPS", LPS_PLACE, 2)),
+        ("p.fcsv", FCSV.format("LPS", "1,b,3", 2)),
+        ("p.fcsv", FCSV.format("LPS", "1,nan,3", 2)),
+        ("p.fcsv", "# CoordinateSystem = LPS\n# columns = id,x,y,z\n"),
+        ("p.mrk.json", b"\x80"),
+        ("p.mrk.json", markups("IJK")),
+        ("p.mrk.json", markups(None)),
+        ("p.mrk.json", markups(coordinateUnits="m")),
+        ("p.mrk.json", markups(place=(1, 2))),
+        ("p.mrk.json", markups(place=("a", 1, 2))),
+        ("p.mrk.json", {"markups": []}),
+        ("p.mrk.json", [1]),
+        ("none.csv", None),
     ],
 )
-def test_markups_that_say_too_little_are_refused(tmp_path, content, words):
-    with pytest.raises(InputError, match=words):
-        read_points(written(tmp_path / "F.mrk.json", json.dumps(content)))
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (FCSV.format("2", LPS_PLACE, 2), "system is 2; it must be LPS or RAS"),
-        (FCSV.replace("# CoordinateSystem = {}\n", "").format(LPS_PLACE, 2), "system is missing"),
-        (FCSV.replace("# columns", "# names").format("LPS", LPS_PLACE, 2), "lacks '# columns"),
-        (FCSV.format("LPS", "1,b,3", 2), "point 'hilum'"),
-        (FCSV.format("LPS", "1,nan,3", 2), "NaN"),
-        ("# CoordinateSystem = LPS\n# columns = id,x,y,z\n", "holds no points"),
-    ],
-)
-def test_fiducial_lists_that_say_too_little_are_refused(tmp_path, text, words):
-    with pytest.raises(InputError, match=words):
-        read_points(written(tmp_path / "F.fcsv", text))
+def test_files_that_are_none_are_refused(tmp_path, name, content):
+    path = tmp_path / name
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        written(path, content if isinstance(content, str) else json.dumps(content))
+    with pytest.raises(InputError, match=re.escape(name)):
+        read_points(path)
 
 
 # --- are they about this organ ---
@@ -303,22 +258,17 @@ def test_points_about_the_organ_pass():
 
 
 @pytest.mark.parametrize(
-    ("points", "words"),
+    ("points", "box"),
     [
-        (some_points() * [-1, -1, 1], "are RAS, it seems"),
-        (some_points() / 1000, "in metres, it seems"),
-        (some_points() + [0, 200, 0], "every point lies more than 100 mm away"),
-        (some_points() / 10, "every point lies more than 100 mm away"),
+        (some_points() * [-1, -1, 1], BOX),  # RAS
+        (some_points() / 1000, BOX),  # metres
+        ((some_points() - MIDDLE) / 1000, BOX - MIDDLE),
+        (some_points() + [0, 200, 0], BOX),  # another frame
     ],
 )
-def test_points_in_another_frame_or_unit_are_refused(points, words):
-    with pytest.raises(InputError, match=words):
-        check_near_organ(points, BOX, "p")
-
-
-def test_metres_are_seen_where_the_organ_lies_about_the_origin():
-    with pytest.raises(InputError, match="in metres"):
-        check_near_organ((some_points() - MIDDLE) / 1000, BOX - MIDDLE, "p")
+def test_points_in_another_frame_or_unit_are_refused(points, box):
+    with pytest.raises(InputError):
+        check_near_organ(points, box, "p")
 
 
 def test_single_strays_are_told_and_kept():
@@ -329,9 +279,9 @@ def test_single_strays_are_told_and_kept():
 
 def test_a_motion_without_an_answer_is_no_answer(tmp_path):
     table = read_points(written(tmp_path / "p.csv", "x,y,z\n1,2,3\n"))
-    with pytest.raises(NoEstimate, match="no place"):
+    with pytest.raises(NoEstimate):
         camera_table(table, OneWay(lambda points: points * np.nan))
-    with pytest.raises(InputError, match="does not know"):
+    with pytest.raises(InputError):
         write_estimate(tmp_path / "out", located(), points=table)
     assert not (tmp_path / "out").exists()
 
@@ -365,7 +315,7 @@ class Knowing:
         return located(Wave(sure=True))
 
 
-def test_locate_writes_where_the_points_are(slim_model, cloud, tmp_path, monkeypatch, capsys):
+def test_locate_writes_where_the_points_are(slim_model, cloud, tmp_path, monkeypatch):
     monkeypatch.setattr("tumortrack.tracking.tracker.Tracker", Knowing)
     points = np.concatenate([some_points(4), MIDDLE[None] + [0, 0, 131.0]])
     lines = [f"{n},{','.join(map(str, p))}" for n, p in enumerate(points)]
@@ -379,9 +329,6 @@ def test_locate_writes_where_the_points_are(slim_model, cloud, tmp_path, monkeyp
     assert report["map"]["points"] == 5
     assert report["map"]["sha256"] == store.sha256_of(asked)
     assert any("1 of 5 points" in note for note in report["notes"])
-    said = capsys.readouterr().out
-    assert "1 of 5 points" in said
-    assert "points.csv" in said
     assert "points.csv" in store.read_manifest(tmp_path / "out", "run")["files"]
     # The answer may be asked again, into the same folder.
     replace(locate, map=tmp_path / "out" / "points.csv", overwrite=True).run()
@@ -401,11 +348,10 @@ def test_points_that_cannot_be_meant_cost_no_locating(slim_model, cloud, tmp_pat
 def test_python_takes_the_commands_options(slim_model, cloud, tmp_path):
     import tumortrack as tt
 
-    with pytest.raises(InputError, match=r"knows no 'crop'; allowed: .*box"):
-        tt.locate(slim_model, cloud, crop=1)
-    depth = tmp_path / "depth.png"
-    depth.write_bytes(cloud.read_bytes())
-    with pytest.raises(InputError, match=r"absent\.json"):  # one camera, as text
-        tt.locate(str(slim_model), str(depth), intrinsics=str(tmp_path / "absent.json"))
-    with pytest.raises(InputError, match="2 times for 1 view"):
-        tt.locate(slim_model, [cloud], intrinsics=["a.json", "b.json"])
+    for cloud_of, options, named in (
+        (cloud, {"crop": 1}, "crop"),
+        (str(cloud.rename(tmp_path / "depth.png")), {"intrinsics": "absent.json"}, "absent"),
+        ([cloud], {"intrinsics": ["a.json", "b.json"]}, "2 times"),
+    ):
+        with pytest.raises(InputError, match=named):
+            tt.locate(str(slim_model), cloud_of, **options)

@@ -15,9 +15,9 @@ from tumortrack.tracking.tracker import Tracker
 
 
 @pytest.fixture(scope="module")
-def carried(clinic_model):
+def carried(slim_model):
     """An estimate of a model that knows a planned cut, an open sheet through the organ."""
-    model = load_model(clinic_model, "cpu")
+    model = load_model(slim_model, "cpu")
     anatomy = model.shape.anatomy_ct
     low, high = anatomy.organ.box_mm
     x, y = np.meshgrid(np.linspace(low[0], high[0], 9), np.linspace(low[1], high[1], 9))

@@ -28,14 +28,10 @@ Rows = tuple[tuple[float, float, float, float], ...]
 
 
 class CalibrationFile(Config, frozen=True, kw_only=True):
-    """The camera's pose, in one of three ways, each as 4 x 4 rows: ``camera_from_robot`` or
-    ``robot_from_camera``, of a hand-eye calibration, or ``camera_from_marker`` with
-    ``robot_from_marker``, of a marker known to both. For a camera that a robot moves:
-    ``tool_from_camera``. ``unit``: of translations, and of the plane's offset. ``frame_id``: the
-    robot's frame in ROS; ``camera_frame_id``: the camera's optical frame in the source's messages;
-    ``table_in_camera``: the table's plane in the camera's frame, unit normal (3) and offset.
-    ``error_mm`` and ``error_deg``: bounds of the calibration's error, at the camera and of its
-    direction; without ``error_deg`` the first holds at the organ."""
+    """The camera's pose, in one of three ways, each as 4 x 4 rows: ``camera_from_robot``,
+    ``robot_from_camera``, or ``camera_from_marker`` with ``robot_from_marker``. For a camera that a
+    robot moves: ``tool_from_camera``. ``unit``: of translations, and of the plane's offset.
+    ``frame_id``: the robot's frame in ROS; the others as in ``PublishedFrame``."""
 
     frame_id: str
     unit: Literal["mm", "m"]
@@ -59,10 +55,9 @@ class CalibrationFile(Config, frozen=True, kw_only=True):
 
 
 def read_frames(path: Path, moves: bool = False) -> PublishedFrame:
-    """The robot's frame from a calibration file: JSON with the keys of ``CalibrationFile``, or YAML
-    as easy_handeye (ROS 1 and 2) writes it. ``moves``: for a camera on a tool. Raises InputError if
-    it is missing, or has an unknown key, a matrix that is no rigid transform, or not exactly one
-    way of giving the pose."""
+    """The robot's frame from JSON with keys of ``CalibrationFile``, or YAML of easy_handeye (ROS
+    1 and 2). ``moves``: for a camera on a tool. Raises InputError: it is missing, has an
+    unknown key, no rigid transform, or not exactly one way of giving the pose."""
     of_ros = path.suffix.lower() in _YAML
     given = _easy_handeye(path) if of_ros else read_json(path)
     file = from_builtins(given, CalibrationFile, str(path))

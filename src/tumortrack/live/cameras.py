@@ -124,14 +124,6 @@ class Cameras:
         return all(worker.on_demand for worker in self.workers)
 
     @property
-    def opened(self) -> int:
-        return sum(worker.opened for worker in self.workers)
-
-    @property
-    def defects(self) -> list[str]:
-        return [defect for worker in self.workers for defect in worker.defects]
-
-    @property
     def latency_from(self) -> str:
         return self.workers[self._lead].latency_from
 

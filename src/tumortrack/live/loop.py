@@ -72,13 +72,9 @@ class LoopConfig(Config, frozen=True, kw_only=True):
             raise InputError(f"frozen_s is {self.frozen_s:g}; it must be 0 (any) or more.")
 
 
-class _TooLate(NoEstimate):
-    """The estimate is right, but its frame is stale by now."""
-
-
 def check_age(age_s: float, stale_s: float, other_clock: bool = True) -> None:
-    """Raises NoEstimate for a frame that is stale, or from the future. ``age_s``: since it was
-    made, or arrived; ``other_clock``: by a camera's clock against this computer's."""
+    """Raises NoEstimate for a frame that is stale, or from the future. ``other_clock``: the age is
+    by a camera's clock against this computer's."""
     clocks = "the clocks of camera and computer"
     if age_s > stale_s:
         doubt = f", if {clocks} agree" if other_clock else ""
@@ -88,8 +84,7 @@ def check_age(age_s: float, stale_s: float, other_clock: bool = True) -> None:
 
 
 class Loop:
-    """One run from a source to sinks: until the source ends, another thread calls ``stop``, or the
-    time is up."""
+    """One run from a source to sinks: until the source ends, ``stop`` is called, or time is up."""
 
     def __init__(
         self,
@@ -150,10 +145,7 @@ class Loop:
         finally:
             if self._arms is not None and not self._arms.ended:
                 self._arms.abort(Halt("ended"))
-                self._publish(
-                    self._without_frame("tracking has ended"),
-                    sink_workers,
-                )
+                self._publish(self._without_frame("tracking has ended"), sink_workers)
 
     def _results(self, source_worker: Cameras) -> Iterator[TrackingResult]:
         fresh_s = time.monotonic()
@@ -176,7 +168,7 @@ class Loop:
                 result, shown_s = self._shown(got, source_worker)
                 yield result
             elif got is not None:
-                yield self._without_frame(_reason_of(got))
+                yield self._without_frame(got)
             elif source_worker.ended:
                 return
             elif opening and ready_s:
@@ -203,14 +195,13 @@ class Loop:
     ) -> TrackingResult:
         """The result of one frame of the time ``born_ns``. ``live_clock``: time goes on while we
         work, so an answer can come too late: more than ``stale_s`` after its frame."""
-        seconds: dict[str, float] = {}
-        organ, estimate, reason, warning = None, None, "", ""
+        organ, estimate, reason, warning, timely = None, None, "", "", False
         quality: Quality = "none"
         finding: Finding | None = None
-        timely = False
         views: list[CameraView] = []
         absent: dict[int, str] = {}  # cameras without the organ, and why
         found: list[OrganInView] = []
+        seconds: dict[str, float] = {}
         several = len(self._cameras.workers) > 1
         try:
             # Simulations have this computer's clock, and so has the arrival.
@@ -226,29 +217,33 @@ class Loop:
             found, doubt = self.views.find(views, absent, seconds)
             organ = found[0][1]
             with timed(seconds, "locate"):
-                estimate = self.views.locate(found, self._evidence(found[0][0]))
+                known: tuple[Evidence, ...] = ()
+                if self._arms is not None:
+                    place, stamp_ns = found[0][0].published_from_camera, found[0][0].seen.stamp_ns
+                    known = self._arms.evidence(np.linalg.inv(place), stamp_ns)
+                estimate = self.views.locate(found, known)
             seconds |= {f"locate.{k}": v for k, v in estimate.report.timings.items()}
             if several:
                 estimate = estimate.reporting(cameras=tuple(view.number for view, _ in found))
             finding, warning = self._confirmed(estimate, doubt)
             quality = "good" if finding is None else "poor"
             if live_clock and _age_s(born_ns) > stale_s:
-                raise _TooLate(Finding("too_late", {"seconds": _age_s(born_ns)}))
+                raise NoEstimate(Finding("too_late", {"seconds": _age_s(born_ns)}))
         except Exception as error:
+            finding = _finding_of(error)
             estimate, reason, quality, warning = None, str(error), "none", ""
             # If only the time was wrong, the last estimate is the best start of the next search.
-            finding = _finding_of(_reason_of(error))
-            if timely and not isinstance(error, _TooLate):
+            if timely and finding.kind != "too_late":
                 self._follower.lose()
                 self._in_a_row = 0
             if not isinstance(error, TumortrackError):  # a defect of ours: the next frame is tried
                 self.statistics.add_defect(error)
-                values = {"words": type(error).__name__, "error": str(error)}
-                finding = Finding("defect", values)
+                finding = Finding("defect", {"words": type(error).__name__, "error": str(error)})
                 reason = finding.words
         self._stamp = (seen.stamp_ns, time.monotonic_ns())
-        if seen.frame_id and not self._published.calibrated:
-            self._published = self._published.named(seen.frame_id)
+        unnamed = self._published.frame_id == "camera" and not self._published.calibrated
+        if unnamed and seen.frame_id:
+            self._published = replace(self._published, frame_id=seen.frame_id)
         published, numbers = self._published, [view.number for view, _ in found]
         lead = found[0][0] if found else next(iter(views), None)
         return TrackingResult(
@@ -282,8 +277,8 @@ class Loop:
             return finding, finding.words
         return finding, warning
 
-    def _without_frame(self, reason: str | Finding) -> TrackingResult:
-        """The result without a frame; its stamp is now, by the source's clock if that is known."""
+    def _without_frame(self, reason: str | Finding | Exception) -> TrackingResult:
+        """Its stamp is now, by the source's clock if that is known."""
         stamp_ns = time.time_ns()
         if self._stamp is not None:
             last_ns, then_ns = self._stamp
@@ -332,12 +327,6 @@ class Loop:
         self.statistics.add(result)
         return result
 
-    def _evidence(self, lead: CameraView) -> tuple[Evidence, ...]:
-        if self._arms is None:
-            return ()
-        camera_from_published = np.linalg.inv(lead.published_from_camera)
-        return self._arms.evidence(camera_from_published, lead.seen.stamp_ns)
-
     def _act(self, arms: live.ArmsController, result: TrackingResult) -> TrackingResult:
         try:
             if self._context.controls.aborted.is_set():
@@ -358,12 +347,9 @@ def _check_heard(silent_s: float, most_s: float, trouble: str) -> None:
         )
 
 
-def _reason_of(error: Exception) -> str | Finding:
-    return error.finding or str(error) if isinstance(error, NoEstimate) else str(error)
-
-
-def _finding_of(reason: str | Finding) -> Finding:
-    return reason if isinstance(reason, Finding) else Finding("source", {"words": reason})
+def _finding_of(reason: str | Finding | Exception) -> Finding:
+    known = reason.finding if isinstance(reason, NoEstimate) else reason
+    return known if isinstance(known, Finding) else Finding("source", {"words": str(reason)})
 
 
 def _age_s(born_ns: int) -> float:
@@ -374,10 +360,11 @@ def summary(
     loop: Loop, source: SourceWorker | Cameras, sink_workers: list[SinkWorker]
 ) -> dict[str, Any]:
     """The report of a run (JSON types): counts, latencies and stage times in ms."""
+    readers = source.workers if isinstance(source, Cameras) else (source,)
     return loop.statistics.summary() | {
         "dropped": source.dropped,
-        "opened": source.opened,
+        "opened": sum(reader.opened for reader in readers),
         "latency_from": source.latency_from,
         "sinks": {worker.name: worker.summary() for worker in sink_workers},
-        "defects": [*loop.statistics.defects, *source.defects],
+        "defects": loop.statistics.defects + [each for one in readers for each in one.defects],
     }

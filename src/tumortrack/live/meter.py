@@ -60,7 +60,7 @@ class RunStatistics:
         self.errors: dict[str, Histogram] = {}  # mm, of a source that knows the truth
         self.counts: Counter[str] = Counter()  # by quality
         self.reasons: Counter[str] = Counter()  # in words, numbers replaced by #
-        self._labels: dict[tuple[str, object], str] = {}
+        self._labels: dict[object, str] = {}
         self.cameras: Counter[str] = Counter()  # of several: estimates that each took part in
         self.clock_jumps = 0  # how often the source's clock was set back
         self.defects: list[str] = []
@@ -69,12 +69,9 @@ class RunStatistics:
         self.counts[result.quality] += 1
         if result.reason:
             finding = result.finding or Finding("source", {"words": result.reason})
-            if finding.same_as not in self._labels:
-                several = len(self._labels) < _KINDS
-                self._labels[finding.same_as] = (
-                    finding.words_without_numbers if several else "other reasons"
-                )
-            self.reasons[self._labels[finding.same_as]] += 1
+            more = len(self._labels) >= _KINDS
+            label = "other reasons" if more else finding.words_without_numbers
+            self.reasons[self._labels.setdefault(finding.same_as, label)] += 1
         for name, stage_s in result.seconds.items():
             self.stages.setdefault(name, Histogram()).add(1000 * stage_s)
         if result.estimate is None:

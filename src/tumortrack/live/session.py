@@ -52,11 +52,19 @@ class Arms:
 
 
 class Session:
-    """A source's frames on their way to sinks; made by ``session``.
+    """A run of `track`, before anything is opened. What is wrong is reported before a model is
+    loaded.
+
+    Args:
+        model: a tracker, or the folder of a case or model.
+        sinks: as written on the command line, their configurations, or sinks.
 
     Attributes:
         unwritten: why the report could not be written last; empty: it could.
         started: a frame came.
+
+    Raises:
+        InputError, ArtifactError: an option, a file or a combination of them cannot be used.
     """
 
     cameras: Cameras
@@ -64,31 +72,63 @@ class Session:
 
     def __init__(
         self,
-        tracker: Tracker,
-        setup: CameraSetup,
-        named: Mapping[str, Any],
-        config: LoopConfig,
-        arms: Arms | None,
-        tools: Mapping[str, ToolConfig],
+        model: Tracker | Path,
+        source: str | SourceConfig,
+        sinks: Sequence[Any],
+        options: TrackOptions,
+        arms: Arms | None = None,
     ) -> None:
-        self._tools = tools
-        self.tracker, self.setup, self._named, self._config = tracker, setup, named, config
-        self.arms, model = arms, tracker.model
+        # What executes was checked with its own.
+        self.setup = setup = _cameras(source, options) if arms is None else arms.setup
+        self._named, self._tools = named_sinks(sinks), named_tools(options.tool)
+        digest = {}
+        if isinstance(model, Tracker):
+            if options.advise:
+                raise InputError(
+                    "--advise is of a case or model; a Tracker has its own (advise=...)."
+                )
+            self.tracker = model
+            _check(setup, model.model.patient, "the model", options)
+        else:
+            folder = model_folder(model)
+            _check(setup, patient_of(read_model_manifest(folder), folder), str(model), options)
+            digest = {"model_sha256": store.sha256_of(folder / store.MANIFEST)}
+            self.tracker = Tracker(load_model(folder, options.device), options.advise)
+        tracker, loaded = self.tracker, self.tracker.model
+        if setup.still and tracker.anatomy_ct is None:
+            raise InputError("--views needs a model that knows a motion: give the case itself.")
+        self._config = config = _loop_config(options, loaded)
+        self.arms = arms
         self._context = SinkContext(
-            model.parts,
+            loaded.parts,
             setup.published,
             tracker.anatomy_ct,
             arms=arms is not None,
-            patient=model.patient,
+            patient=loaded.patient,
             cameras=setup.still,
             tip_mm=None if arms is None else arms.tip_mm,
             corrected=config.correction != DepthCorrection(),
-            tools=tuple(tools),
+            tools=tuple(self._tools),
         )
         self.loop = Loop(tracker, self._context, config, None if arms is None else arms.operation)
-        self.report: Path | None = None
-        self.about: dict[str, Any] = {}
-        self.unwritten, self.started = "", False
+        self.report, self.unwritten, self.started = options.report, "", False
+        frames = setup.published
+        placed = None if frames.moves else frames.published_from_camera.tolist()
+        self.about = {
+            "patient": to_builtins(loaded.patient),
+            "model": loaded.provenance,
+            "notes": [weakness.words for weakness in loaded.warnings],
+            **digest,
+            "source": next(iter(setup.sources)),
+            "sinks": list(self._named),
+            "config": to_builtins(config),
+            "frame": {"frame_id": frames.frame_id, "published_from_camera": placed},
+            "views": list(options.views),
+            "moving": options.moving,
+            "tool": list(options.tool),
+            "published_from_cameras": [place.tolist() for place in setup.still],
+            **({} if arms is None else arms.about),
+        }
 
     @contextmanager
     def opened(self) -> Iterator[None]:
@@ -108,10 +148,8 @@ class Session:
 
     def _open_cameras(self) -> Cameras:
         workers = [SourceWorker(source.open) for source in self.setup.sources.values()]
-        here = self.setup.published.published_from_camera
-        return Cameras(
-            workers, self.setup.poses or self.setup.still or (here,), self._config.stale_s
-        )
+        places = self.setup.still or (self.setup.published.published_from_camera,)
+        return Cameras(workers, self.setup.poses or places, self._config.stale_s)
 
     def _end(self, error: type[BaseException] | None, *_: object) -> None:
         if error is None or self.started:
@@ -163,63 +201,6 @@ class Session:
             self.unwritten = str(error)
 
 
-def session(
-    model: Tracker | Path,
-    source: str | SourceConfig,
-    sinks: Sequence[Any],
-    options: TrackOptions,
-    arms: Arms | None = None,
-) -> Session:
-    """Everything that `track` needs, before anything is opened. What is wrong is reported before
-    a model is loaded.
-
-    Args:
-        model: a tracker, or the folder of a case or model.
-        sinks: as written on the command line, their configurations, or sinks.
-
-    Raises:
-        InputError, ArtifactError: an option, a file or a combination of them cannot be used.
-    """
-    setup = _cameras(source, options) if arms is None else arms.setup  # what executes was checked
-    named, tools = named_sinks(sinks), named_tools(options.tool)
-    digest = {}
-    if isinstance(model, Tracker):
-        if options.advise:
-            raise InputError("--advise is of a case or model; a Tracker has its own (advise=...).")
-        tracker = model
-        _check(setup, model.model.patient, "the model", options)
-    else:
-        folder = model_folder(model)
-        _check(setup, patient_of(read_model_manifest(folder), folder), str(model), options)
-        digest = {"model_sha256": store.sha256_of(folder / store.MANIFEST)}
-        tracker = Tracker(load_model(folder, options.device), options.advise)
-    if setup.still and tracker.anatomy_ct is None:
-        raise InputError("--views needs a model that knows a motion: give the case itself.")
-    config = _loop_config(options, tracker.model)
-    made = Session(tracker, setup, named, config, arms, tools)
-    frames = setup.published
-    placed = None if frames.moves else frames.published_from_camera.tolist()
-    made.report, made.about = (
-        options.report,
-        {
-            "patient": to_builtins(tracker.model.patient),
-            "model": tracker.model.provenance,
-            "notes": [weakness.words for weakness in tracker.model.warnings],
-            **digest,
-            "source": next(iter(setup.sources)),
-            "sinks": list(named),
-            "config": to_builtins(config),
-            "frame": {"frame_id": frames.frame_id, "published_from_camera": placed},
-            "views": list(options.views),
-            "moving": options.moving,
-            "tool": list(options.tool),
-            "published_from_cameras": [place.tolist() for place in setup.still],
-            **({} if arms is None else arms.about),
-        },
-    )
-    return made
-
-
 def _cameras(source: str | SourceConfig, options: TrackOptions) -> CameraSetup:
     wrong = ""
     if options.box and (options.views or options.moving):
@@ -237,9 +218,9 @@ def _check(setup: CameraSetup, patient: Patient, what: str, options: TrackOption
     """InputError: the model (``what``) or a source is of another patient, depths were corrected
     already, or the report has no place."""
     patient.check_is(options.stated, what)
+    corrects = read_camera(options.intrinsics)[1] != DepthCorrection()
     for text, source in setup.sources.items():
         source.patient().check_shown(patient, text)
-        corrects = read_camera(options.intrinsics)[1] != DepthCorrection()
         if corrects and getattr(source, "is_corrected", False):
             raise InputError(
                 f"the depths of {text} were corrected as they were recorded. Leave "

@@ -1,9 +1,8 @@
-"""``kind:target?key=value&key=value`` -> the configuration of a source or sink.
+"""``kind:target?key=value&key=value`` -> the configuration of a source, sink, pose or tool.
 
-A kind is a configuration class: one listed here, or one that an installed package, such as
-tumortrack-devices, offers by an entry point in ``tumortrack.sources``, ``tumortrack.sinks``,
-``tumortrack.poses`` or ``tumortrack.tools``, named as the class's ``tag``. Only the requested kind
-is imported, so a broken package affects no other.
+A kind is a configuration class that an installed package, such as tumortrack-devices, offers by an
+entry point in ``tumortrack.sources``, ``.sinks``, ``.poses`` or ``.tools``, named as the class's
+``tag``. Only the requested kind is imported, so a broken package affects no other.
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.packages import to_install
 from tumortrack.core.report import Point
-from tumortrack.core.tables import read_table
 from tumortrack.live.poses import PosesConfig
 from tumortrack.live.tools import ToolConfig
 from tumortrack.live.values import SinkConfig, SourceConfig
@@ -39,15 +37,15 @@ class Extension(NamedTuple):
 
 @dataclass(frozen=True)
 class Registry(Generic[C]):
-    """All kinds of source, sink, poses or tool: ``built_in`` (``module:class`` by kind), and those
-    of the entry points' ``group``. ``what`` names one in messages; ``base`` is the base class;
-    ``packages``: what to install for the kinds of our other distributions."""
+    """The kinds of one ``what``: those of the entry points' ``group``, of the class ``base``, and
+    ``built_in`` ones (``module:class`` by kind). ``packages``: what to install for the kinds of our
+    other distributions."""
 
     what: str
     group: str
     base: Any
-    built_in: Mapping[str, str]
     packages: Mapping[str, str] = field(default_factory=dict)
+    built_in: Mapping[str, str] = field(default_factory=dict)
 
     def parse(self, text: str) -> C:
         """The configuration that ``text`` describes. Raises InputError for an unknown kind, key or
@@ -71,24 +69,18 @@ class Registry(Generic[C]):
             yield Extension(self.what, entry.name, _package_of(entry), fault)
 
     def config(self, kind: str, where: str, entries: Sequence[EntryPoint] | None = None) -> type[C]:
-        """The configuration class of a kind, among ``entries`` (None: all that are installed, for
-        which every package is asked). Raises InputError, which begins with ``where``."""
+        """The configuration class of a kind, among ``entries`` (None: all that are installed).
+        Raises InputError, which begins with ``where``."""
         if kind in self.built_in:
             return EntryPoint(kind, self.built_in[kind], self.group).load()
         entries = self._entry_points() if entries is None else entries
         matches = [entry for entry in entries if entry.name == kind]
-        if not matches and kind == "ros1":
-            raise InputError(
-                f"{where}: ROS 1 was removed after its end of life, May 2025. Bridge its topics to "
-                "ROS 2 (ros1_bridge) and say ros2, or play a .bag: recording:PATH."
-            )
         if not matches and kind in self.packages:
             raise InputError(
                 f"{where}: {kind!r} is not installed here: {to_install(self.packages[kind])}."
             )
         if not matches:
-            installed = {entry.name for entry in entries}
-            allowed = sorted({*self.built_in, *installed, *self.packages})
+            allowed = sorted({*self.built_in, *self.packages, *(entry.name for entry in entries)})
             raise InputError(f"{where}: there is no kind {kind!r}. Allowed: {', '.join(allowed)}.")
         if len(matches) > 1:
             packages = " and ".join(sorted(map(_package_of, matches)))
@@ -98,11 +90,9 @@ class Registry(Generic[C]):
             config: type[C] = matches[0].load()
             fault = f"offers {matches[0].value}, which is no {self.base.__name__} of tumortrack"
             if isinstance(config, type) and issubclass(config, self.base):
-                tag = config.__struct_config__.tag
-                if tag == kind:
+                if (tag := config.__struct_config__.tag) == kind:
                     return config
-                names = f"names its entry point {kind!r}, and its class {tag!r}"
-                fault = f"{names}; both must be the same"
+                fault = f"names its entry point {kind!r}, and its class {tag!r}: not the same"
         except Exception as error:  # a foreign package raises anything
             cause = error
             fault = f"offers {kind!r}, but it cannot be imported ({type(error).__name__}: {error})"
@@ -114,16 +104,39 @@ class Registry(Generic[C]):
         return sorted(entry_points(group=self.group), key=lambda entry: entry.name)
 
 
-_PACKAGES = read_table("tumortrack.live", "packages.toml", dict[str, dict[str, str]])
+def _devices(*kinds: str, **others: str) -> dict[str, str]:
+    return dict.fromkeys(kinds, "tumortrack-devices") | others
+
+
 SOURCES = Registry[SourceConfig](
-    "source", "tumortrack.sources", SourceConfig, {}, _PACKAGES["sources"]
+    "source",
+    "tumortrack.sources",
+    SourceConfig,
+    _devices(
+        *("virtual", "recording", "ros2"),
+        realsense="tumortrack-devices[realsense]",
+        stereo="tumortrack-devices[stereo]",
+        rehearsal="tumortrack-lab",
+    ),
 )
-SINKS = Registry[SinkConfig]("sink", "tumortrack.sinks", SinkConfig, {}, _PACKAGES["sinks"])
-_FILE = {"file": "tumortrack.live.poses:PosesFileConfig"}
+SINKS = Registry[SinkConfig](
+    "sink",
+    "tumortrack.sinks",
+    SinkConfig,
+    _devices(
+        *("viewer", "recording", "ros2", "moveit", "openigtlink"), ur="tumortrack-resection[ur]"
+    ),
+)
 POSES = Registry[PosesConfig](
-    "camera's pose", "tumortrack.poses", PosesConfig, _FILE, _PACKAGES["poses"]
+    "camera's pose",
+    "tumortrack.poses",
+    PosesConfig,
+    _devices("ros2", "ur"),
+    {"file": "tumortrack.live.poses:PosesFileConfig"},
 )
-TOOLS = Registry[ToolConfig]("tool", "tumortrack.tools", ToolConfig, {}, _PACKAGES["tools"])
+TOOLS = Registry[ToolConfig](
+    "tool", "tumortrack.tools", ToolConfig, _devices("file", "ros2", "openigtlink", "ur")
+)
 
 
 def extensions() -> list[Extension]:
@@ -136,65 +149,45 @@ def _package_of(entry: EntryPoint) -> str:
 
 
 def _filled(config: type[C], target: str, options: str, where: str) -> C:
+    def refused(what: str) -> InputError:
+        return InputError(f"{where}{what}. {usage(config)}")
+
     given: dict[str, str] = {}
     for option in filter(None, options.split("&")):
         key, _, value = option.partition("=")  # not unquoted: paths may contain + and %
         if key in given:
-            raise InputError(f"{where}: {key!r} is given twice.")
+            raise refused(f": {key!r} is given twice")
         given[key] = value
     fields = {field.name: field for field in msgspec.structs.fields(config)}
     target_name = getattr(config, "target", "")
     if target and (not target_name or target_name in given):
-        raise InputError(f"{where}: {target!r} has no place there. {usage(config)}")
+        raise refused(f": {target!r} has no place there")
     if target:
         given[target_name] = target
     if unknown := [key for key in given if key not in fields]:
-        raise InputError(f"{where}: {unknown[0]!r} is no option. {usage(config)}")
+        raise refused(f": {unknown[0]!r} is no option")
     if missing := [n for n, f in fields.items() if f.required and n not in given]:
-        raise InputError(f"{where} lacks its {missing[0]}. {usage(config)}")
-    values = {}
-    for key, text in given.items():
-        kind = fields[key].type
-        try:
-            words = text.split(",") if kind in (Point, Point | None) else text
-            values[key] = msgspec.convert(words, kind, strict=False, dec_hook=_path)
-        except msgspec.ValidationError as error:
-            allowed = _allowed(msgspec.inspect.type_info(kind))
-            raise InputError(
-                f"{where}: {key} is {text!r}; allowed: {allowed}. {usage(config)}"
-            ) from error
+        raise refused(f" lacks its {missing[0]}")
     try:
-        return config(**values)
-    except (TypeError, ValueError) as error:  # of a foreign class's own check
-        raise InputError(f"{where}: {error}. {usage(config)}") from error
+        return config(**{key: _value(key, fields[key].type, text) for key, text in given.items()})
+    except (TypeError, ValueError) as error:  # also of a foreign class's own check
+        raise refused(f": {error}") from error
+
+
+def _value(key: str, kind: Any, text: str) -> Any:
+    words = text.split(",") if kind in (Point, Point | None) else text
+    try:
+        return msgspec.convert(words, kind, strict=False, dec_hook=_path)
+    except msgspec.ValidationError as error:
+        literals = getattr(msgspec.inspect.type_info(kind), "values", ())
+        allowed = f"allowed: {', '.join(map(str, literals))}" if literals else error
+        raise ValueError(f"{key} is {text!r}; {allowed}") from error
 
 
 def _path(kind: type, value: object) -> object:
     if kind is Path and isinstance(value, str):
         return Path(value)
     raise TypeError(f"{kind.__name__} is not read from text")
-
-
-_WORDS: dict[type, str] = {
-    msgspec.inspect.BoolType: "true or false",
-    msgspec.inspect.IntType: "a whole number",
-    msgspec.inspect.FloatType: "a number",
-    msgspec.inspect.NoneType: "null",
-    msgspec.inspect.TupleType: "X,Y,Z",
-}
-_BOUNDS = {"ge": "from", "gt": "more than", "le": "to", "lt": "less than"}
-
-
-def _allowed(info: msgspec.inspect.Type) -> str:
-    if isinstance(info, msgspec.inspect.Metadata):
-        return _allowed(info.type)
-    if isinstance(info, msgspec.inspect.UnionType):
-        return ", ".join(map(_allowed, info.types))
-    if isinstance(info, msgspec.inspect.LiteralType):
-        return ", ".join(map(str, info.values))
-    bounds = [(word, getattr(info, key, None)) for key, word in _BOUNDS.items()]
-    words = [f"{word} {bound:g}" for word, bound in bounds if bound is not None]
-    return " ".join([_WORDS.get(type(info), "other text"), *words])
 
 
 def usage(config: type[Config]) -> str:

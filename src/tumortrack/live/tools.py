@@ -38,7 +38,7 @@ class Tool:
         """The user says that it touches now; of one that holds, that it takes or lets go."""
 
     def located(self, view: CameraView, estimate: Estimate) -> None:
-        """Where the organ is in that view; called where it was found."""
+        """Where the organ was found in that view."""
 
     def close(self) -> None:
         """Release everything."""

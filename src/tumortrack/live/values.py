@@ -1,9 +1,5 @@
-"""The values of live tracking, and the interfaces of sources and sinks.
-
-A source returns an ``Observation``, from which the loop makes one ``TrackingResult``. Each sink
-gets every result or, if it is slow, the newest. A source or sink is one file: a configuration with
-a method ``open``. Other packages can add their own: see ``live.spec`` and docs/live.md.
-"""
+"""The values of live tracking, and the interfaces of sources and sinks: a source returns an
+``Observation``, the loop makes one ``TrackingResult`` from it, and each sink gets that."""
 
 from __future__ import annotations
 
@@ -110,10 +106,6 @@ class PublishedFrame:
     error_deg: float = 0.0
     moves: bool = False
 
-    def named(self, frame_id: str) -> PublishedFrame:
-        """By this name, if it is the camera's frame and has none."""
-        return replace(self, frame_id=frame_id) if self.frame_id == "camera" else self
-
     def of_camera(self, published_from_camera: Affine) -> PublishedFrame:
         """The same frame, for a camera at another pose."""
         if np.array_equal(published_from_camera, self.published_from_camera):
@@ -148,9 +140,9 @@ class TransformedEstimate:
 
 @dataclass(frozen=True, eq=False)
 class RigidShape:
-    """A surface that moves rigidly: a link of an arm, a table, a planned piece. ``name`` is unique
-    within a workcell, with slashes between levels (``cutter/forearm``). Sinks may send the surface
-    again only when ``mesh`` is another object than before, otherwise only its pose."""
+    """A surface that moves rigidly: a link of an arm, a table, a planned piece. ``name``: unique
+    within a workcell, with slashes between levels. Sinks need to send the surface again only when
+    ``mesh`` is another object."""
 
     name: str
     mesh: Mesh  # in its own frame, mm
@@ -212,12 +204,11 @@ class Workcell:
 
     @property
     def drawn_lines(self) -> list[Polyline]:
-        """The lines that have a length."""
         return [line for line in self.lines if len(line.points_mm) > 1]
 
     @property
     def box_mm(self) -> Float64[np.ndarray, "2 3"] | None:
-        """The bounding box of the bounding boxes of all shapes; None without any."""
+        """Of the boxes of all shapes; None without any."""
         if not self.shapes:
             return None
         boxes = np.array([shape.mesh.box_mm for shape in self.shapes])  # (n, 2, 3)
@@ -310,8 +301,7 @@ class TrackingResult:
     @property
     def published_from_ct(self) -> Affine | None:
         """The organ's pose without its deformation; None without a motion."""
-        motion = None if self.estimate is None else self.estimate.report.motion
-        if motion is None:
+        if self.estimate is None or (motion := self.estimate.report.motion) is None:
             return None
         return self.published_frame.published_from_camera @ np.array(motion.camera_from_ct)
 

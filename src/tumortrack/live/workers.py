@@ -36,15 +36,13 @@ _ACCEPTED_AFTER = 3  # frames whose stamps increase: then the clock was set back
 
 
 class StampOrder:
-    """Refuses stamps that go back unless the clock was set back. It must see every frame: of two
-    that were swapped the loop may get only one."""
+    """Refuses stamps that go back, unless the clock was set back. It must see every frame."""
 
     def __init__(self) -> None:
         self._last_ns = -1
         self._behind: list[int] = []
 
     def check(self, stamp_ns: int) -> None:
-        """Raises NoEstimate for a frame that is out of order."""
         if stamp_ns < 0:
             raise NoEstimate(Finding("stamp_negative", {"stamp_ns": stamp_ns}))
         back_ns = self._last_ns - stamp_ns
@@ -58,8 +56,8 @@ class StampOrder:
 
 class SourceWorker:
     """Opens a source, reads it, and reopens it when it is lost. If frames come faster than they are
-    taken, the newest stays and the others count as dropped; a ``lossless`` source is read only as
-    they are taken. An error about a frame, its order too, is handed over before later frames."""
+    taken, the newest stays and the others count as dropped; a ``lossless`` source waits. An error
+    about a frame, its order too, is handed over before later frames."""
 
     def __init__(self, open_source: Callable[[], Source]) -> None:
         self._open = open_source
@@ -150,12 +148,9 @@ class SourceWorker:
         """Once the source has worked, any error may be temporary."""
         if not self.opened and not isinstance(error, SourceLost):
             self.failure = error  # handed to the loop, which raises it
-        elif isinstance(error, TumortrackError):
-            self.trouble = str(error)
-        else:
-            self.trouble = f"internal error, {_text_of(error)}"
+        self.trouble = _text_of(error)
+        if not isinstance(error, TumortrackError) and len(self.defects) < _DEFECTS:
             self.defects.append("".join(traceback.format_exception(error)))
-            del self.defects[_DEFECTS:]
         self.on_demand = False
 
     def _read_all(self) -> None:

@@ -40,7 +40,6 @@ class BoundFactor(Config, frozen=True):
 
 
 def write_factor(path: Path, found: BoundFactor) -> None:
-    """Write a file for ``read_factor``, atomically. Raises StorageError."""
     content = to_builtins(found)
     store.write_json(path, {"sha256": _digest(content), "bound_factor": content})
 

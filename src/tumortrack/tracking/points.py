@@ -1,13 +1,9 @@
 """Points of the CT that a user asks about (vessels, margins, planned cuts): reading them, checking
 them, and writing where they are now.
 
-points.csv: a header, comma-separated columns, coordinates in mm in one of four namings: ct_x, ct_y,
-ct_z or x, y, z or l, p, s (all LPS), or r, a, s (RAS, converted to LPS here). Further columns
-(label, name, ...) are kept.
-
-Markups of 3D Slicer (.mrk.json, .fcsv): the program shows RAS and writes LPS; a file says which of
-them it holds. Format:
-https://slicer.readthedocs.io/en/latest/developer_guide/modules/markups.html
+points.csv: a header and columns, mm: ct_x, ct_y, ct_z or x, y, z or l, p, s (all LPS), or r, a, s
+(RAS). Further columns are kept. Markups of 3D Slicer (.mrk.json, .fcsv) say which of the two they
+hold: https://slicer.readthedocs.io/en/latest/developer_guide/modules/markups.html
 """
 
 from __future__ import annotations
@@ -54,9 +50,8 @@ class PointTable:
 
 
 def read_points(path: Path) -> PointTable:
-    """Read points.csv, or a 3D Slicer markups file (.fcsv, .mrk.json). Raises InputError: no such
-    file, another format or unit, no points, a value that is not a finite number, or a Slicer file
-    whose coordinate system is neither LPS nor RAS."""
+    """Read a .csv, .fcsv or .mrk.json. Raises InputError: no such file, another format or unit, no
+    points, a number that is not finite, or a coordinate system other than LPS and RAS."""
     content = read_file(path, _MOST_BYTES, "Give the points in several files.")
     name = path.name.lower()
     parse = next((parse for end, parse in _PARSERS.items() if name.endswith(end)), None)
@@ -84,17 +79,16 @@ def _parse_csv(content: bytes, name: str) -> PointTable:
     _check_size(points_ct, [f"{name}, line {line}" for line, _ in rows])
     # The file may be the output for an earlier frame, whose results are replaced.
     kept = [n for column, n in columns.items() if column not in _ADDED]
-    replaced = ", ".join(column for column in header if column.lower() in _ADDED)
-    notes = {
-        f"{name}: its columns {replaced} give way to the answer's.": replaced,
-        f"{name}: left out {without} of {len(table.rows)} points that have no place yet "
-        f"({_DEFINED} is 0).": without,
-    }
+    notes = []
+    if replaced := ", ".join(column for column in header if column.lower() in _ADDED):
+        notes.append(f"{name}: its columns {replaced} give way to the answer's.")
+    if without:
+        notes.append(f"{name}: left out {without} points without a place ({_DEFINED} is 0).")
     return PointTable(
         points_ct,
         tuple(header[n] for n in kept),
         tuple(tuple(row[n] for n in kept) for _, row in rows),
-        tuple(note for note, holds in notes.items() if holds),
+        tuple(notes),
     )
 
 
@@ -118,8 +112,7 @@ class _Markups(msgspec.Struct):
 class _Fiducial(NamedTuple):
     label: str
     description: str
-    point_ct: np.ndarray
-    is_placed: bool
+    point_ct: np.ndarray | None  # None: it has no place yet
 
 
 def _parse_markups(content: bytes, name: str) -> PointTable:
@@ -131,10 +124,9 @@ def _parse_markups(content: bytes, name: str) -> PointTable:
         if set(np.atleast_1d(markup.coordinate_units).tolist()) != {"mm"}:
             raise InputError(f"{name}: the unit is {markup.coordinate_units!r}; it must be mm.")
         signs = _signs(markup.coordinate_system, name)
-        points += [
-            _Fiducial(p.label, p.description, signs * p.position, p.position_status == "defined")
-            for p in markup.control_points
-        ]
+        for point in markup.control_points:
+            place = signs * point.position if point.position_status == "defined" else None
+            points.append(_Fiducial(point.label, point.description, place))
     return _fiducials(points, name)
 
 
@@ -151,11 +143,12 @@ def _parse_fcsv(content: bytes, name: str) -> PointTable:
     with readable(name, "is damaged"):  # below the header # may begin a name
         rows = [row for row in csv.reader(io.StringIO(text[columns.end() :])) if any(row)]
     for row in rows:
-        cells = dict(zip(names, row, strict=False))
-        label, is_placed = cells.get("label", ""), len(row) <= _STATUS or row[_STATUS] == _PLACED
-        where = f"{name}, point {label!r}"
-        place = [number_in(cells.get(axis, ""), where) for axis in "xyz" if is_placed] or [0.0] * 3
-        points.append(_Fiducial(label, cells.get("desc", ""), signs * place, is_placed))
+        cells, place = dict(zip(names, row, strict=False)), None
+        label = cells.get("label", "")
+        if len(row) <= _STATUS or row[_STATUS] == _PLACED:
+            where = f"{name}, point {label!r}"
+            place = signs * [number_in(cells.get(axis, ""), where) for axis in "xyz"]
+        points.append(_Fiducial(label, cells.get("desc", ""), place))
     return _fiducials(points, name)
 
 
@@ -167,14 +160,13 @@ def _signs(system: str, name: str) -> np.ndarray:
 
 
 def _fiducials(points: list[_Fiducial], name: str) -> PointTable:
-    missing = [point.label for point in points if not point.is_placed]
-    placed = [point for point in points if point.is_placed]
-    points_ct = np.reshape([point.point_ct for point in placed], (-1, 3))
-    _check_size(points_ct, [f"{name}, point {point.label!r}" for point in placed])
+    missing = [point.label for point in points if point.point_ct is None]
+    placed = [(point[:2], point.point_ct) for point in points if point.point_ct is not None]
+    points_ct = np.reshape([place for _, place in placed], (-1, 3))
+    _check_size(points_ct, [f"{name}, point {about[0]!r}" for about, _ in placed])
     note = f"{name}: left out {len(missing)} that have no place yet: {', '.join(missing)}."
-    rows = tuple((*point[:2], *(f"{x:.5f}" for x in point.point_ct)) for point in placed)
-    columns = ("label", "description", *_CT)
-    return PointTable(points_ct, columns, rows, (note,) if missing else ())
+    rows = tuple((*about, *(f"{x:.5f}" for x in place)) for about, place in placed)
+    return PointTable(points_ct, ("label", "description", *_CT), rows, (note,) * bool(missing))
 
 
 _PARSERS = {".json": _parse_markups, ".fcsv": _parse_fcsv, ".csv": _parse_csv}

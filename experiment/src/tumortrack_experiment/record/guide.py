@@ -15,8 +15,8 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import Affine
 from tumortrack.core.types import DepthFrame, Intrinsics
 from tumortrack.live.cameras import CameraSetup
-from tumortrack.live.frames import FrameCheck
 from tumortrack.live.values import Observation, SourceLost
+from tumortrack.live.views import FrameCheck
 from tumortrack.live.workers import OPENING_S, SourceWorker
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.files import DepthCorrection
