@@ -24,7 +24,7 @@ COMPILER = $(BIN)/python tools/build_backend.py --compiler >/dev/null 2>&1 || { 
 NO_COMPILER = $(BIN)/pip uninstall --quiet --yes ziglang 2>/dev/null
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian clients demo demo-scenes test quick pythons pytest test-hard check attack replay fingerprint figures bench soak wheel lock licences audit results real world sequences plans pull pulls bounds evidence noise rehearsal population site pictures clean
+.PHONY: help setup debian clients demo demo-scenes test quick pythons pytest test-hard check attack replay fingerprint figures bench soak wheel lock licences audit world pull bounds evidence noise rehearsal population site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -127,29 +127,14 @@ bench: setup  ## speed of every part; fills docs/performance.md and docs/data/sp
 soak: setup  ## an hour of tracking with faults of eleven kinds (ARGS="MODEL CASE --minutes 5"; after make demo)
 	$(BIN)/python lab/scripts/soak.py $(ARGS)
 
-results: setup  ## the tables of docs/results.md (hours; ARGS="--case NAME=FOLDER": more organs)
-	$(BIN)/python lab/scripts/results.py $(ARGS)
-
-real: setup  ## real kidneys, breathing lungs, silicone: ARGS='DATA', a folder of your copies (hours)
-	$(BIN)/python lab/scripts/real.py $(ARGS)
-
-world: setup  ## scenes of wider physics, noise and views, and how a model does in them (ARGS="CASE OUT --model MODEL")
+world: setup  ## scenes of wider physics, noise and views, and whether plans cut tumors out of them (ARGS="CASE OUT --plans MODEL")
 	$(BIN)/python lab/scripts/world.py $(ARGS)
 
-demo-scenes: setup  ## the ten scenes that the package brings, from the twin and the world (ARGS=OUT: what takes long is kept there)
+demo-scenes: setup  ## the ten scenes that the package brings (ARGS=OUT: what takes long is kept there)
 	$(BIN)/python lab/scripts/demo.py $(ARGS)
-
-sequences: setup  ## an organ pressed, pushed, rolled, breathing, turned over, and how it is followed (ARGS="CASE OUT --model MODEL")
-	$(BIN)/python lab/scripts/sequences.py $(ARGS)
 
 pull: setup  ## an organ under the pull of a plan's holder, for the virtual source (ARGS="PLAN virtual:CASE?... OUT")
 	$(BIN)/python lab/scripts/pull.py $(ARGS)
-
-plans: setup  ## the instrument's distances in plans of scenes and random kidneys, and what they cost (ARGS="OUT CASE=SCENES ...")
-	$(BIN)/python lab/scripts/plans.py $(ARGS)
-
-pulls: setup  ## whether tumors that the holder pulls are cut out (ARGS="OUT CASE ... --count 40": 15 s a scene)
-	$(BIN)/python lab/scripts/pulls.py $(ARGS)
 
 bounds: setup  ## learns how far off organs and tumors may be, from random organs (ARGS="OUT --write src/tumortrack/assessment/bounds.json"; an hour)
 	$(BIN)/python lab/scripts/bounds.py $(ARGS)

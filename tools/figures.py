@@ -1,6 +1,6 @@
 """Do the pages say what the tables say, and are the tables of today's method?
 
-python tools/figures.py           fill the pages from docs/data (tumortrack_lab.study.document has
+python tools/figures.py           fill the pages from docs/data (tumortrack_lab.document has
                                   the format); exit status 1 where a table is of another method
 python tools/figures.py --check   write nothing; exit status 1 also where a page differs
 """
@@ -16,7 +16,7 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.sense.sensors import FIGURES, simulated
 from tumortrack.tracking.fingerprint import fingerprint
-from tumortrack_lab.study.document import MeasuredTable, rendered
+from tumortrack_lab.document import MeasuredTable, rendered
 
 
 def sensors() -> str:

@@ -21,22 +21,20 @@ from typing import Annotated
 import numpy as np
 import pandas as pd
 import tyro
-from PIL import Image
 
 from tumortrack.cli.console import say
 from tumortrack.core.errors import InputError
 from tumortrack.core.store import write_atomically
 from tumortrack.report import drawing
-from tumortrack_lab.fleet.results import LOOK, PATIENTS, PICTURES, SCENES
-from tumortrack_lab.real.kidneys import SET_ASIDE, WHERE
-from tumortrack_lab.study import scripts
-from tumortrack_lab.study.document import ReportWriter, beside_rigid, share_words, spread_mm
-from tumortrack_lab.world.estimates import BANDS, band_of
+from tumortrack_lab import scripting
+from tumortrack_lab.document import ReportWriter, beside_rigid, share_words, spread_mm
+from tumortrack_lab.fleet.results import LOOK, PATIENTS, SCENES
 
-DEVELOPMENT = (0, 2, 3)
-_WORST = 4  # pictures
+SET_ASIDE, DEVELOPMENT = (91, 93, 96, 146, 155), (0, 2, 3)
+WHERE = "data/case_NNNNN/segmentation.nii.gz of https://github.com/neheller/kits19"
+_HIDDEN = {"nothing hidden": 0.0, "up to 40 %": 0.4, "over 40 %": np.inf}  # of the surface
 BLOCK = "population"
-_ERRORS = {
+ERRORS = {
     "centre": "middle_mm",
     "best rigid pose's centre": "rigid_middle_mm",
     "Hausdorff": "hausdorff_mm",
@@ -84,7 +82,7 @@ def main(options: Options) -> None:
         write_atomically(options.list, "\n".join([head, *lines, ""]).encode())
         say(f"{len(lines)} kidneys listed in {options.list}.")
     if options.fleet is not None:
-        writer = scripts.begun("population", options.document)
+        writer = scripting.begun("population", options.document)
         fill(options.fleet, writer)
         say(f"written to {options.document}.")
 
@@ -109,22 +107,18 @@ def fill(fleet: Path, writer: ReportWriter) -> None:
     if done.empty:
         raise InputError(f"{fleet} has no patient that is done.")
     scenes = scenes.merge(people[["patient", "slice_mm"]], on="patient")
-    scenes = scenes.reindex(columns=[*dict.fromkeys([*scenes, *_ERRORS.values(), "radius_mm"])])
-    without = scenes.rigid_fit_middle_mm.isna().all()
+    scenes = scenes.reindex(columns=[*dict.fromkeys([*scenes, *ERRORS.values(), "radius_mm"])])
     draw(scenes, writer.image(BLOCK))
-    draw_worst(scenes, fleet / PICTURES, writer.image(f"{BLOCK}_worst"))
     rows, alone = grouped(scenes), len(done[~done.patient.isin(looks.patient)])
     sample = (
         f"{len(people)} patients, {len(done)} done, {alone} with nothing for a person to look at, "
         f"{int(done.scenes.sum())} scenes, {int(done.lost.sum())} more could not be made"
-        f"{', without rigid fits' if without else ''}"
     )
     short = rows[rows.by.isin(["all", "state"])]
     more = {"over 5 mm": "over 5 mm", "of good": "good within radius %"}
     more["rank correlation"] = "rank correlation"
     shown = short[["value", "scenes", "good %"]].assign(**beside_rigid(short))
     short = shown.join(short[[*more]].rename(columns=more))
-    short = short.drop(columns=["rigid fit"] if without else [])
     good = scenes[scenes.verdict == "good"]
     share = share_words(int(good.over_5_mm.sum()), len(good)) if len(good) else "none"
     tables = {"": short, "-groups": rows, "-wrong": wrong(scenes), "-look": looks}
@@ -134,9 +128,10 @@ def fill(fleet: Path, writer: ReportWriter) -> None:
 
 def grouped(scenes: pd.DataFrame) -> pd.DataFrame:
     """Verdicts and errors by load and by tumor; a scene counts once for each tumor."""
-    bands = pd.Categorical(scenes.hidden_share.map(band_of), BANDS)
+    limits = [-np.inf, *_HIDDEN.values()]
+    bands = pd.cut(scenes.hidden_share, limits, labels=[*_HIDDEN])
     given = {"all": pd.Series("all", scenes.index), "state": scenes.family}
-    given |= {"hidden": pd.Series(bands, scenes.index), "kind": scenes.kind, "at": scenes.position}
+    given |= {"hidden": bands, "kind": scenes.kind, "at": scenes.position}
     for column, (words, limits) in _AGAINST.items():
         given[words] = pd.cut(scenes[column], limits, right=False)
     rows = []
@@ -147,7 +142,7 @@ def grouped(scenes: pd.DataFrame) -> pd.DataFrame:
             row["tumors"] = mine.groupby(["patient", "tumor"]).ngroups
             for verdict in ("good", "poor", "refused"):
                 row[f"{verdict} %"] = f"{100 * (mine.verdict == verdict).mean():.0f}"
-            for words, column in _ERRORS.items():
+            for words, column in ERRORS.items():
                 row |= spread_mm(words, good[column])
             row |= {f"over {mm} mm": int(good[f"over_{mm}_mm"].sum()) for mm in (3, 5)}
             said = mine.dropna(subset=["radius_mm"])
@@ -187,22 +182,5 @@ def draw(scenes: pd.DataFrame, path: Path) -> None:
     drawing.save(figure, path)
 
 
-def draw_worst(scenes: pd.DataFrame, pictures: Path, path: Path) -> None:
-    """The worst good answers over the truth, each of another patient: as the fleet drew them."""
-    good = scenes[scenes.verdict == "good"].sort_values("middle_mm", ascending=False)
-    names = good.drop_duplicates("patient").patient.head(_WORST)
-    drawn = [place for name in names if (place := pictures / f"{name}-worst.webp").exists()]
-    if not drawn:
-        return
-    lines = -(-len(drawn) // 2)
-    figure = drawing.new_figure(14.4, 7.4 * lines, left=0.0, right=1.0, top=0.98, bottom=0.0)
-    for number, place in enumerate(drawn, start=1):
-        axes = figure.add_subplot(lines, 2, number)
-        axes.imshow(Image.open(place))
-        axes.set_title(place.stem.removesuffix("-worst"), fontsize=11, loc="left")
-        axes.set_axis_off()
-    drawing.save(figure, path)
-
-
 if __name__ == "__main__":
-    scripts.run(main, Options)
+    scripting.run(main, Options)

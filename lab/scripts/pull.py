@@ -3,8 +3,9 @@
     make pull ARGS='PLAN virtual:CASE?breathing=false&instrument=false OUT.safetensors'
     tumortrack resect PLAN viewer --live CASE 'virtual:CASE?...&pulled=OUT.safetensors'
 
-The plan is made with a `--cell` file that gives pull_mm. Finite elements: see
-tumortrack_lab.world.pulled. The organ is pulled where it lies when the source begins.
+The plan is made with a `--cell` file that gives pull_mm. Finite elements, which share nothing with
+the elastic body of the default method: fat below the rim and vessels at the hilum hold the organ,
+and the cup of a vacuum grasper pulls its surface, where the organ lies when the source begins.
 """
 
 from __future__ import annotations
@@ -23,12 +24,26 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.live.spec import SOURCES
 from tumortrack_devices.pulled import PulledStates
 from tumortrack_devices.sources.virtual import VirtualSourceConfig
-from tumortrack_lab.study import scripts
-from tumortrack_lab.world.pulled import Held
-from tumortrack_lab.world.scenes import TETS, World, WorldConfig
+from tumortrack_lab import scripting
+from tumortrack_lab.world.families import (
+    BED_DEPTH_MM,
+    GRIP_MN_MM,
+    Deformed,
+    equilibria,
+    even_tissue,
+    volume_change,
+)
+from tumortrack_lab.world.forces import Springs
+from tumortrack_lab.world.organ import Organ, Stage, Vector
+from tumortrack_lab.world.scenes import World, WorldConfig
+from tumortrack_lab.world.tets import TETS
 from tumortrack_resection.files import read_plan
 
 _STATES = 5  # of a pull, the one at rest included
+_CUP_MM = 8.0  # radius of the grasper's cup
+_RIM = 0.4  # of the organ's height: below, fat holds it
+_BED_KPA, _VESSELS_MN_MM = 5.0, 200.0
+_STEP_MM = 2.0  # of the pull, at a time
 
 
 @dataclass(frozen=True)
@@ -63,8 +78,7 @@ def main(options: Options) -> None:
     rest_ct = np.concatenate([part.vertices_mm for part in player.anatomy_ct.parts])
     rest_mm = transform_points(world.bench_from_ct, rest_ct)
     pulls_mm = np.linspace(0.0, stored.cell.pull_mm, 2 * _STATES - 1)
-    held = Held.plain(world.organ)
-    states = held.pulled(surface[apart_mm.argmin()], up, pulls_mm.tolist())
+    states = pulled(world.organ, surface[apart_mm.argmin()], up, pulls_mm.tolist())
     moved_mm = np.stack([state.carry(rest_mm) - rest_mm for state in states])
     moved_mm = moved_mm @ world.bench_from_ct[:3, :3]
     sha256 = store.sha256_of(source.case / store.MANIFEST)
@@ -86,5 +100,28 @@ def main(options: Options) -> None:
     )
 
 
+def pulled(organ: Organ, grip_mm: Vector, way: Vector, pulls_mm: list[float]) -> list[Deformed]:
+    """The states in which the cup, which took the surface's place ``grip_mm`` (bench frame, at
+    rest), has moved so far along the unit vector ``way``; from small to large. Raises
+    TumortrackError: no equilibrium was found."""
+    solid, rim_mm = even_tissue(organ), _RIM * float(organ.size_mm[2])
+    stage = Stage(organ, solid)
+    low = np.flatnonzero(organ.points_mm[:, 2] < rim_mm)
+    fat = _BED_KPA / BED_DEPTH_MM * organ.areas_mm2[low]
+    vessels = stage.grip(stage.patch(organ.hilum_mm, 15.0), np.zeros(3), _VESSELS_MN_MM)
+    steady = Springs(stage.rows(low), organ.points_mm[low], fat), vessels
+    patch = stage.patch(grip_mm, _CUP_MM)
+    states, done_mm, nodes = [], 0.0, organ.mesh.nodes_mm
+    for pull_mm in pulls_mm:
+        steps = max(1, int(np.ceil((pull_mm - done_mm) / _STEP_MM)))
+        ways = np.linspace(done_mm, pull_mm, steps + 1)[1:]
+        loads = [(*steady, stage.grip(patch, mm * way, GRIP_MN_MM)) for mm in ways]
+        nodes = equilibria(solid, loads, nodes)[0][-1] if pull_mm > 0 else nodes
+        done_mm = pull_mm
+        about = {"pull_mm": pull_mm, "volume_change": volume_change(solid, nodes)}
+        states.append(Deformed(organ, nodes, organ.mesh.tets, rim_mm, None, about))
+    return states
+
+
 if __name__ == "__main__":
-    scripts.run(main, Options)
+    scripting.run(main, Options)

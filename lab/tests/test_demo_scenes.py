@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import demo
 import numpy as np
 import pytest
 
@@ -9,10 +10,7 @@ from tumortrack.core.errors import NoEstimate, TumortrackError
 from tumortrack.core.geometry import transform_points
 from tumortrack.imaging.case import load_case
 from tumortrack.simulate import datasets
-from tumortrack_lab.twin.apparatus import bench_from_ct
-from tumortrack_lab.twin.dataset import StateCache
-from tumortrack_lab.twin.views import EquilibriumState
-from tumortrack_lab.world import demo
+from tumortrack_lab.world import twin
 from tumortrack_lab.world.families import Deformed
 
 pytestmark = pytest.mark.slow
@@ -22,15 +20,14 @@ def test_the_first_state_and_the_first_view_that_there_are(phantom_case, tmp_pat
     """All states at rest. The first seed has no equilibrium, the first view shows no organ."""
     tried, views, find = [], [], demo.organ_cloud
 
+    def at_rest(organ):
+        return Deformed(organ, organ.mesh.nodes_mm, organ.mesh.tets, 10.0, None, {})
+
     def solve(organ, family, seed):
         tried.append((family, seed))
         if seed == 0:
             raise TumortrackError("no equilibrium")
-        return Deformed(organ, organ.mesh.nodes_mm, organ.mesh.tets, 10.0, None, {})
-
-    def get(cache, name, say):
-        anatomy, points = demo.moved(case.anatomy, to_bench), inner.points_ct
-        return EquilibriumState(name, anatomy, transform_points(to_bench, points), to_bench, {})
+        return at_rest(organ)
 
     def found(view, organ, rng):
         views.append(view)
@@ -38,13 +35,12 @@ def test_the_first_state_and_the_first_view_that_there_are(phantom_case, tmp_pat
             raise NoEstimate("not in the image")
         return find(view, organ, rng)
 
-    case = load_case(phantom_case)
-    inner = demo.draw_targets(case.anatomy, 0)
-    to_bench = bench_from_ct(case.anatomy.organ, case.up_lps)
+    monkeypatch.setattr(twin, "EDGE_MM", 10.0)
     monkeypatch.setattr(demo, "solve", solve)
+    monkeypatch.setattr(demo, "solve_twin", lambda bench, *_: at_rest(bench.stage.organ))
     monkeypatch.setattr(demo, "organ_cloud", found)
-    monkeypatch.setattr(StateCache, "get", get)
-    scenes = demo.demo_scenes(phantom_case, tmp_path, lambda text: None)
+    case = load_case(phantom_case)
+    scenes = demo.scenes_of(case, tmp_path)
     assert list(scenes) == list(datasets.phantom_scenes())
     assert tried == [(f, seed) for f in ("cut", "pull", "clamp") for seed in (0, 1)]
     assert [scene.meta["attempt"] for scene in scenes.values()] == [1, *[0] * 9]

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 import pytest
+from evidence import errors, foresight
 
 import world_objects
 from tumortrack.core.errors import ArtifactError
@@ -15,17 +16,21 @@ from tumortrack.core.geometry import triangles_of
 from tumortrack.core.mesh_query import contains
 from tumortrack.report.metrics import distance_to_surface
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack_lab.study.evidence_tables import errors, foresight
 from tumortrack_lab.world.evidence import (
     ALL_TRUE,
     ERRORS,
-    EXACT,
+    EvidenceErrors,
     EvidenceSource,
     hidden,
     met,
     mirrored,
 )
-from tumortrack_lab.world.made import scenes_of
+from tumortrack_lab.world.scenes import random_scenes
+
+EXACT = EvidenceErrors(
+    tip_mm=0.0, hand_eye_mm=(0.0, 0.0), hand_eye_degrees=0.0, probe_mm=0.0, click_mm=0.0,
+    grip_mm=0.0, false_contacts=0.0, slips=0.0,
+)  # fmt: skip
 
 
 @cache
@@ -181,8 +186,8 @@ def test_tables_count_pieces_by_scene_and_misses_by_tumor():
 def test_scenes_that_were_made_or_tried_are_not_made_again(tmp_path):
     for name in ("case", "scenes"):
         (tmp_path / name).mkdir()
-    scene().write(tmp_path / "scenes" / "00002-rest-none")  # the two before had no equilibrium
-    assert [path.name for path in scenes_of(tmp_path, 1, 3)] == ["00002-rest-none"]
-    assert scenes_of(tmp_path, 1, 2) == []
+    scene().write(tmp_path / "scenes" / "00002-rest")  # the two before had no equilibrium
+    assert [path.name for path in random_scenes(tmp_path, 1, 3)] == ["00002-rest"]
+    assert random_scenes(tmp_path, 1, 2) == []
     with pytest.raises(ArtifactError):  # there is no case to make the fourth from
-        scenes_of(tmp_path, 1, 4)
+        random_scenes(tmp_path, 1, 4)

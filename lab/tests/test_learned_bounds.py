@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
-
-from tumortrack_lab.study.bounds import bounded, learned, left_out, quantile_of
+from bounds import bounded, learned, left_out, quantile_of
 
 TRUE = {"center_std": 0.8, "nearest": 0.4, "cost": 0.0}
 

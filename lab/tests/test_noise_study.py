@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import runpy
-from pathlib import Path
-
+import noise
 import numpy as np
 import pandas as pd
 import pytest
+from noise import Condition, disturbed, placed
 
 from stories import looking_down
 from tumortrack.core.errors import InputError
@@ -15,12 +14,9 @@ from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.imaging.case import load_case
 from tumortrack.sense.camera import d405, deproject
 from tumortrack.simulate.scene_folder import Scene
-from tumortrack_lab.study import noise
-from tumortrack_lab.study.noise import Condition, disturbed, placed
-from tumortrack_lab.twin.apparatus import moved
+from tumortrack_lab.world.organ import moved
 from world_objects import ANATOMY
 
-SCRIPT = runpy.run_path(str(Path(__file__).parents[2] / "lab" / "scripts" / "noise.py"))
 FLAT = DepthFrame(np.full((480, 848), 300.0, np.float32), d405())
 
 
@@ -105,13 +101,13 @@ def test_each_condition_is_measured_once_and_is_a_line_of_the_table(
         Scene(cloud, there).write(tmp_path / "scenes" / name)
     page = tmp_path / "page.md"
     page.write_text("<!-- results:noise -->\n<!-- /results:noise -->\n")
-    options = SCRIPT["Options"](
+    options = noise.Options(
         tmp_path / "rows",
         (f"{clinic_model}={tmp_path / 'scenes'}",),
         conditions=("white:0", "strays:20"),
         document=page,
     )
-    SCRIPT["main"](options)
+    noise.main(options)
     files = sorted(path.name for path in (tmp_path / "rows").rglob("*.json"))
     assert files == ["strays-20.json", "white-0.json"]
     table = pd.read_csv(tmp_path / "data" / "noise.csv", comment="#")
@@ -122,5 +118,5 @@ def test_each_condition_is_measured_once_and_is_a_line_of_the_table(
     assert (tmp_path / "images" / "noise.png").read_bytes().startswith(b"\x89PNG")
 
     monkeypatch.setattr(noise, "measured", None)  # nothing is measured again
-    SCRIPT["main"](options)
+    noise.main(options)
     assert pd.read_csv(tmp_path / "data" / "noise.csv", comment="#").equals(table)

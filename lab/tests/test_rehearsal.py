@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from rehearsal_bench import (
+    BEAD_HU,
+    PRINTED_HU,
+    BenchErrors,
+    Hands,
+    looking_down,
+    scan_bench,
+    see_bench,
+    set_up,
+)
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.phantom.scanner import ScannerParameters
 from tumortrack_experiment.kit_file import Bead, Kit, KitPart
-from tumortrack_lab.rehearsal.bench import BEAD_HU, PRINTED_HU, scan_bench, see_bench, set_up
 from tumortrack_lab.rehearsal.camera import BenchSourceConfig
-from tumortrack_lab.rehearsal.hands import BenchErrors, Hands, looking_down
-from tumortrack_lab.rehearsal.run import STATES
-from tumortrack_lab.rehearsal.tables import evaluation_rows
-from tumortrack_lab.twin.views import EquilibriumState
 
-ROOT = Path(__file__).parents[2]
 ROWS = tuple(map(tuple, np.eye(4).tolist()))
 BEADS_MM = ((30.0, 0.0, 8.0), (-30.0, 5.0, 6.0), (3.0, 25.0, 9.0), (-8.0, -24.0, 7.0))
 
@@ -56,15 +59,15 @@ def kit(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def state():
-    """``bench_from_ct`` is not ``base_from_ct``: the twin's bench lies 5 mm beside the kit's."""
+def laid(kit):
+    """The kit with an organ in a state, whose frame lies 5 mm beside the base's."""
     parts = tuple(
         mesh(trimesh.creation.icosphere(subdivisions=3, radius=radius), (5.0, 0, 15))
         for radius in (15.0, 5.0)
     )
     beside = np.eye(4)
-    beside[0, 3] = 5.0
-    return EquilibriumState("D0", Anatomy(parts), np.zeros((0, 3)), beside, {})
+    beside[0, 3] = -5.0
+    return lambda name, beads_mm=None: set_up(*kit, Anatomy(parts), beside, name, beads_mm)
 
 
 def hu_at(volume, points_mm):
@@ -72,8 +75,8 @@ def hu_at(volume, points_mm):
     return volume.hu[tuple(index.T)]
 
 
-def test_the_scanner_sees_what_is_set_up(kit, state):
-    setup = set_up(*kit, state, "rest", {"1": (np.nan, 0, 0), "2": (0.0, 0.0, 5.0)})
+def test_the_scanner_sees_what_is_set_up(laid):
+    setup = laid("rest", {"1": (np.nan, 0, 0), "2": (0.0, 0.0, 5.0)})
     assert len(setup.printed) == 1, "no stand at rest, and no mold on the bench"
     turned = looking_down(50.0, (10.0, 20.0))
     quiet = ScannerParameters(noise_hu=0.0, block_size_mm=(0, 0, 0), spacing_mm=(0.8, 0.8, 0.8))
@@ -90,8 +93,8 @@ def test_the_scanner_sees_what_is_set_up(kit, state):
     assert hu(BEADS_MM[1]) < 0, "the second bead is missing"
 
 
-def test_the_camera_sees_the_nearest_of_all_and_errs_as_it_is_told(kit, state, tmp_path):
-    setup = set_up(*kit, state, "D1")
+def test_the_camera_sees_the_nearest_of_all_and_errs_as_it_is_told(laid, tmp_path):
+    setup = laid("D1")
     assert len(setup.printed) == 2
     hands = Hands(
         tmp_path, BenchErrors(depth_scale=1.01, depth_offset_mm=0.5), looking_down(180, (0, 0))
@@ -115,15 +118,3 @@ def test_the_camera_sees_the_nearest_of_all_and_errs_as_it_is_told(kit, state, t
         < 1
     )
     assert seen.content.intrinsics == hands.believed
-
-
-def test_estimates_are_judged_by_the_second_ct_and_by_the_truth():
-    def report(off_mm):
-        parts = {"kidney": {"center_mm": 9.0}, "tumor_1": {"center_mm": off_mm}}
-        return {"scenes": [{"name": s, "quality": "good", "parts": parts} for s in STATES]}
-
-    rows = evaluation_rows({"scenes": report(0.5), "true-scenes": report(0.3)})
-    assert list(rows.state) == list(STATES)
-    assert rows.iloc[0].to_list()[1:] == ["good", "tumor_1", 0.5, 0.3, pytest.approx(0.2)]
-    columns = ["state", "verdict", "tumor", "by second CT mm", "by truth mm", "apart mm"]
-    assert list(rows) == columns

@@ -3,34 +3,30 @@ camera's noise against its own law, and scenes that replay."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
+from scipy import ndimage
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from reports import report_of
 from tumortrack.core import store
-from tumortrack.core.assessment import Assessment, ErrorBound
-from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.rigid_fit import kabsch
 from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.imaging.meshes import solid_of
 from tumortrack.sense.camera import d405
-from tumortrack.simulate.scene_folder import read_scene
-from tumortrack.tracking.tracker import Tracker
-from tumortrack_lab.tets import TetMesh, tetrahedralise
-from tumortrack_lab.twin.equilibrium import Rod, find_equilibrium
-from tumortrack_lab.twin.solid import NeoHookeanSolid
-from tumortrack_lab.world import estimates, segmentation
+from tumortrack_lab.world import segmentation
+from tumortrack_lab.world.equilibrium import Rod, find_equilibrium
 from tumortrack_lab.world.families import FAMILIES, Deformed, solve
 from tumortrack_lab.world.forces import Bed, Capsule, LoadedBody, Springs, Touch, Weight
+from tumortrack_lab.world.kidneys import random_anatomy
 from tumortrack_lab.world.noise import StereoCamera, StereoConfig
 from tumortrack_lab.world.organ import Slit, Stage, cut_open
+from tumortrack_lab.world.solid import NeoHookeanSolid
+from tumortrack_lab.world.tets import TetMesh, tetrahedralise
 from world_objects import ellipsoid, organ, world
 
 CAMERA = d405(424, 240)
@@ -77,6 +73,21 @@ def test_a_bed_knows_how_far_a_sphere_reaches_into_it() -> None:
     assert depth[0] > 5  # above the rim there is nothing
     np.testing.assert_allclose(depth[1:], -5.0, atol=0.4)
     np.testing.assert_allclose(normal[1:], -directions[1:], atol=0.08)
+
+
+def test_the_bed_is_a_cubic_spline_of_its_grid_with_its_slope():
+    rng = np.random.default_rng(0)
+    bed = Bed(rng.normal(size=(7, 5, 9)), np.array([1.0, -2.0, 3.0]))
+    points = bed.origin_mm + 2.5 * rng.uniform([1, 1, 1], [4.9, 2.9, 6.9], (50, 3))
+    off, slope = bed.outside(points)
+    places = ((points - bed.origin_mm) / 2.5).T
+    expected = ndimage.map_coordinates(bed.values, places, order=3, prefilter=False)
+    np.testing.assert_allclose(off, expected, atol=1e-12)
+    for axis, step in enumerate(1e-4 * np.eye(3)):
+        ahead, behind = bed.outside(points + step)[0], bed.outside(points - step)[0]
+        np.testing.assert_allclose(slope[:, axis], (ahead - behind) / 2e-4, atol=1e-6)
+    with pytest.raises(ValueError, match="4 along each axis"):
+        Bed(np.zeros((7, 3, 9)), np.zeros(3))
 
 
 def test_an_organ_at_rest_stays_and_one_that_is_lifted_falls_back_into_its_bed() -> None:
@@ -232,86 +243,21 @@ def test_the_same_number_is_the_same_scene_to_the_byte(tmp_path) -> None:
     assert store.sha256_of(tmp_path / "c") != digests[0]
 
 
-def test_a_kept_state_is_seen_again_from_elsewhere(tmp_path) -> None:
-    first = world(families=("rest", "plate", "cut"), hidden=0.0)
-    other = world(seed=9, disturbances=("hidden",))
-    for number in range(3):
-        first.scene(number).write(tmp_path / str(number))
-        kept = read_scene(tmp_path / str(number))
-        again = other.again(other.kept(kept), 5, "hidden")
-        there = []
-        for scene in (kept, again):
-            assert scene.meta["case_sha256"] == first.case_sha256
+def test_a_state_is_seen_again_from_elsewhere() -> None:
+    made = world(families=("rest", "plate", "cut"), hidden=0.0)
+    for number in (1, 2):
+        shown, there = made.shown(number), []
+        scenes = made.first(shown), made.again(shown, 5)
+        for scene in scenes:
             assert scene.meta["state"] == f"0-{number}"
             assert scene.targets is not None
+            assert scene.meta["cloud_on_organ"] > 0.9
             back = np.linalg.inv(np.array(scene.meta["camera_from_bench"]))
             points = [scene.targets.points_mm, scene.reference.tumors[0].vertices_mm]
             there.append(transform_points(back, np.concatenate(points)))
-        np.testing.assert_array_equal(again.targets.points_ct, kept.targets.points_ct)
-        np.testing.assert_allclose(there[0], there[1], atol=1e-3)
-        views = [np.array(scene.meta["camera_from_bench"]) for scene in (kept, again)]
+        np.testing.assert_allclose(there[0], there[1], atol=1e-9)
+        views = [np.array(scene.meta["camera_from_bench"]) for scene in scenes]
         assert np.abs(views[0] - views[1]).max() > 0.1
-        assert 0.26 < again.meta["hidden_share"] < 0.74
-        assert again.meta["cloud_on_organ"] > 0.9
-    with pytest.raises(InputError, match="another organ"):
-        replace(other, case_sha256="ffff").kept(kept)
-
-
-def test_states_and_disturbances_meet_in_all_pairs() -> None:
-    made = world(families=("rest", "plate"), disturbances=("hidden", "strays", "fat", "side"))
-    pairs = [made.recipe(number, 2, draw) for number in range(4) for draw in range(2)]
-    assert len(set(pairs)) == len(pairs) == 8
-
-
-def test_estimates_are_held_against_truth_and_rigid_pose_once_and_wrong_ones_named(
-    tmp_path, monkeypatch
-) -> None:
-    (tmp_path / "model").mkdir()
-    (tmp_path / "model" / store.MANIFEST).write_text("{}")
-    out, made = tmp_path / "organ", world(disturbances=("none", "nothing"), hidden=0.0)
-    names = ["0-rest-none", "1-rest-nothing"]
-    scenes = [made.scene(number) for number in range(2)]
-    for name, scene in zip(names, scenes, strict=True):
-        scene.write(out / name)
-    back = np.linalg.inv(np.array(scenes[0].meta["camera_from_bench"]))
-    shift = np.linalg.inv(back)  # before the camera, and 10 mm beside where it lies
-    shift[:3, 3] += [6.0, 8.0, 0.0]
-    motion = SimpleNamespace(
-        carry=lambda points: transform_points(shift @ made.bench_from_ct, points),
-        std_mm=lambda points: np.ones(len(points)),
-    )
-    told = report_of(parts={"kidney": {}, "tumor_1": {}})
-    said = Assessment(bounds={"tumor_1": ErrorBound(3.0)})
-    about = {"quality": "good", "reason": "", "motion": motion, "report": told, "assessment": said}
-    answer, asked = SimpleNamespace(**about), []
-    monkeypatch.setattr(Tracker, "follow", lambda _, cloud, seen: asked.append(cloud) or answer)
-    monkeypatch.setattr(estimates, "load_model", lambda *args, **how: None)
-    monkeypatch.setattr(estimates, "Tracker", lambda model: Tracker.__new__(Tracker))
-    for upto in (1, 2, 2):
-        estimates.measure(tmp_path / "model", made.anatomy_ct, out, names[:upto])
-    assert len(asked) == 2
-    rows = estimates.read_rows([out])
-    assert rows.off[0] == pytest.approx(10.0, abs=1.5)  # as segmentation errs
-    assert rows["shape"][0] < 1.5
-    assert rows.rigid[0] < 1.5
-    assert 0 < rows.fit[0] < 3.0
-    assert list(rows.wrong) == [True, True]
-    lines, off = estimates.verdicts(rows), f"{rows.off[0]:.1f}"
-    known = lines.set_index(["by", "value"]).T
-    assert list(known["family", "rest"])[:6] == [1, 0, 0, 1, 1, off]
-    assert list(known["disturbance", "nothing"])[:6] == [1, 0, 0, 1, 1, ""]
-    each = (f"{rows[name][0]:.1f}" for name in ("off", "rigid", "fit"))
-    shown = " | ".join(f"{mm} / {mm} / {mm}" for mm in each)
-    assert f"| rest | 1 | 1 | 1 | {shown} |" in estimates.summary(lines)
-    before = estimates.verdicts(rows.assign(fit=np.nan))
-    assert f"| {shown.rpartition(' |')[0]} | – |" in estimates.summary(before)
-    wrong = estimates.wrong_ones(rows)
-    assert list(wrong.wrong) == ["wrong pose", "not this organ"]
-    assert list(wrong.scene) == names
-    assert estimates.wrong_ones(rows.assign(wrong=False)).empty
-    monkeypatch.setattr(estimates, "fingerprint", lambda: "another")
-    with pytest.raises(InputError, match="another version"):
-        estimates.read_rows([out])
 
 
 def test_a_hand_or_instruments_hide_the_share_that_was_asked_for() -> None:
@@ -324,20 +270,19 @@ def test_a_hand_or_instruments_hide_the_share_that_was_asked_for() -> None:
     assert np.ptp(shares) > 0.2
 
 
-def test_disturbed_scenes_say_what_disturbs_them() -> None:
-    kinds = ("strays", "white", "scale", "side", "mirrored", "foreign", "nothing")
-    made = world(disturbances=kinds, hidden=0.0, segmentation=0.0)
-    scenes = {kind: made.scene(number) for number, kind in enumerate(kinds)}
-    for kind, scene in scenes.items():
-        assert scene.meta["disturbance"]["kind"] == kind
-        right = kind not in ("mirrored", "foreign", "nothing")
-        assert scene.meta["model_organ"] is right
-        assert (scene.targets is not None) is right
-    how = {kind: scene.meta["disturbance"] for kind, scene in scenes.items()}
-    z_mm = scenes["scale"].reference.organ.vertices_mm[:, 2].min()
-    seen = scenes["scale"].cloud.points_mm[:, 2].min()
-    assert seen == pytest.approx(how["scale"]["scale"] * z_mm + how["scale"]["offset_mm"], abs=4.0)
-    assert scenes["side"].meta["cloud_on_organ"] > 0.9
-    box = np.ptp(scenes["mirrored"].reference.tumors[0].vertices_mm, axis=0)
-    assert (box > 10).all()
-    assert scenes["nothing"].reference.tumors == ()
+@pytest.mark.parametrize("seed", range(4))
+def test_a_random_kidney_is_closed_holds_its_tumors_and_repeats(seed) -> None:
+    (anatomy, up), (again, _) = random_anatomy(seed), random_anatomy(seed)
+    assert np.array_equal(anatomy.organ.vertices_mm, again.organ.vertices_mm)
+    assert not np.isclose(anatomy.organ.volume_mm3, random_anatomy(seed + 1)[0].organ.volume_mm3)
+    assert np.linalg.norm(up) == pytest.approx(1)
+    solids = [solid_of(part, "part") for part in anatomy.parts]
+    assert 1 <= len(anatomy.tumors) <= 3
+    spread = anatomy.organ.vertices_mm - anatomy.organ.vertices_mm.mean(0)
+    axis = np.linalg.svd(spread, full_matrices=False)[2][0]
+    assert 80 < np.ptp(spread @ axis) < 165  # 90 to 130 mm, and bulging tumors
+    for part, solid in zip(anatomy.parts, solids, strict=True):
+        assert solid.volume() == pytest.approx(part.volume_mm3, rel=1e-3)
+    for part, tumor in zip(anatomy.tumors, solids[1:], strict=True):
+        assert 0.4 < part.volume_mm3 / 1000 < 55  # balls of 10 to 45 mm, in ml
+        assert (tumor - solids[0]).volume() < 0.01 * tumor.volume()

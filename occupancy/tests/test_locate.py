@@ -9,7 +9,6 @@ from pathlib import Path
 import nibabel
 import numpy as np
 import pytest
-import torch
 import trimesh
 
 from stories import answered, cloud_by_rays, looking_down, refusal, succeeded, tumortrack

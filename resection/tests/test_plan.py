@@ -15,7 +15,7 @@ from tumortrack.core.report import Finding
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.live.values import PublishedFrame
-from tumortrack_lab.cut import cut as cut_out
+from tumortrack_lab.world.cut import cut as cut_out
 from tumortrack_resection.budget import planned_budgets
 from tumortrack_resection.drafts import exophytic_shares, plan_resection
 from tumortrack_resection.files import as_builtins, from_plain

@@ -214,8 +214,8 @@ def write_scenes(
 
 
 def export(case: StrPath, folder: StrPath, **options: Unpack[ExportKeywords]) -> tuple[str, ...]:
-    """Write a case, or what was located, as a scene for 3D Slicer, and a CT's as DICOM; returns what
-    to know of the DICOM file. Raises InputError, ArtifactError: folders or options that do not fit
+    """Write a case, or what was located, as a scene for 3D Slicer, and a CT's as DICOM; returns
+    what to know of the DICOM file. Raises InputError, ArtifactError: folders or options that do not fit
     each other, or cannot be used.
 
     Args:
@@ -247,8 +247,8 @@ def train(
 ) -> Model:
     """A model of its own folder. The default preset, ``clinic``, has nothing to learn: a case holds
     its model. For ``quick`` and ``paper`` (of tumortrack-occupancy) the same call resumes after
-    Ctrl-C or a crash. Raises InputError, ArtifactError: no case, an option is not allowed, a part is
-    too small to be learnt, or ``folder`` holds another model or run.
+    Ctrl-C or a crash. Raises InputError, ArtifactError: no case, an option is not allowed, a part
+    is too small to be learnt, or ``folder`` holds another model or run.
 
     Args:
         case: or the folder that ``prepare`` wrote.

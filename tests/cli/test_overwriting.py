@@ -25,7 +25,7 @@ PACKAGES = (
 OPTION = re.compile(r"--[a-z][a-z-]+")
 # Options of other programs that messages name.
 OTHERS = {"--device-cgroup-rule", "--user", "--upgrade"}
-OF_SCRIPTS = {"world", "study", "soak", "rehearsal", "real"}  # of lab/scripts
+OF_SCRIPTS = {"scripting.py"}  # of lab/scripts
 MINE = "of the user's own"
 # Every command that writes, with what it needs before it looks at where it is to write.
 COMMANDS = {

@@ -10,9 +10,9 @@ import trimesh
 
 from tumortrack.core.types import Anatomy, LabelVolume, Mesh
 from tumortrack.imaging.case import Case
-from tumortrack_lab.tets import tetrahedralise
 from tumortrack_lab.world.organ import Organ
 from tumortrack_lab.world.scenes import World, WorldConfig
+from tumortrack_lab.world.tets import tetrahedralise
 
 Vector = tuple[float, float, float]
 

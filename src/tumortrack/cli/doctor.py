@@ -24,7 +24,6 @@ from tumortrack.core.process import available_cores
 from tumortrack.models.method import GROUP
 from tumortrack.native import LIBRARIES, library
 
-
 # What each distribution is for, and each of its extras; "": what it always needs.
 PURPOSES = {
     ("tumortrack", ""): "cases, locating, tracking",

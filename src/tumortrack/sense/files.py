@@ -268,9 +268,8 @@ def _camera(path: Path) -> _Camera:
         return value
 
     width, height, fx, fy, cx, cy = map(number, _PINHOLE_KEYS)
-    for key, pixels in (("width", width), ("height", height)):
-        if not pixels.is_integer():
-            raise InputError(f"{path}: {key} is {pixels}; it must be a whole number.")
+    if not (width.is_integer() and height.is_integer()):
+        raise InputError(f"{path}: {width:g} x {height:g} pixels; these must be whole numbers.")
     error = None  # nobody has calibrated it
     if data.keys() & {_LEFT_KEY, "depth_scale", "depth_offset_mm"}:
         error = DepthError(number(_LEFT_KEY, CALIBRATED_MM))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -31,18 +31,20 @@ class Bench:
     def run(self) -> None:
         """Measure, show, write. Raises InputError: no such document."""
         from tumortrack.cli.console import say
-        from tumortrack.core.process import available_cores
-        from tumortrack_lab.bench.report import figures, write_bench
-        from tumortrack_lab.bench.run import GROUPS, measure, tasks_of
-        from tumortrack_lab.study.scripts import check_page
+        from tumortrack_lab.bench import GROUPS, describe_machine, measure, tables_of
+        from tumortrack_lab.scripting import begun
 
         if self.out.exists() and "machine" not in store.read_json(self.out):
             store.check_place(self.out, "", None)  # no bench wrote it
         words = ["tumortrack bench", *(["--only", *self.only] if self.only else [])]
         command = " ".join([*words, *(["--quick"] if self.quick else [])])
-        check_page(self.document)
-        groups: tuple[str, ...] = self.only or tuple(GROUPS)
-        result = measure(tasks_of(groups, MODELS, self.quick, available_cores()), command)
-        print(figures(result).to_string(index=False))
-        for path in write_bench(result, self.out, self.document):
-            say(f"written to {path}")
+        writer = replace(begun("bench", self.document), command=command)
+        machine = describe_machine()
+        rows = measure(self.only or tuple(GROUPS), MODELS, self.quick)
+        tables = tables_of(rows, machine)
+        print(tables["speed-rows"].to_string(index=False))
+        self.out.parent.mkdir(parents=True, exist_ok=True)
+        found = {"machine": machine, "command": command, "rows": [asdict(row) for row in rows]}
+        store.write_json(self.out, found)
+        say(f"written to {self.out}")
+        writer.tables(tables, sample="medians of calls")

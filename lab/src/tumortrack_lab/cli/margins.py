@@ -14,7 +14,7 @@ from tumortrack.core.config import check_seed
 from tumortrack.core.errors import InputError
 
 if TYPE_CHECKING:
-    from tumortrack_lab.margins.table import Row
+    from tumortrack_lab.margins import Row
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +41,7 @@ class Margins:
         """Raises InputError: scenes that can't be used, or too few of them."""
         from tumortrack.models.folder import read_model_manifest
         from tumortrack.tracking.bound_factor import NAME, write_factor
-        from tumortrack_lab.margins.factor import LEAST, found_factor, list_states
+        from tumortrack_lab.margins import LEAST, found_factor, list_states
 
         check_seed(self.seed)
         if not self.scenes:
@@ -71,8 +71,7 @@ def located(
     from tumortrack.simulate.scene_folder import read_scene
     from tumortrack.tracking.model_files import load_model
     from tumortrack.tracking.tracker import Tracker
-    from tumortrack_lab.margins.factor import Locating
-    from tumortrack_lab.margins.table import head_of, open_table
+    from tumortrack_lab.margins import Locating, head_of, open_table
 
     scenes = {str(state.resolve()): state for state in states}
     with open_table(table, head_of(store.sha256_of(folder / store.MANIFEST), seed)) as (known, add):

@@ -35,10 +35,10 @@ class Twin:
         """Make what is missing of these states and views; empty means all. Raises InputError: no
         case, unknown names, or scenes made from something else."""
         with live_line("starting ...") as report:
-            from tumortrack_lab.twin.dataset import TwinRun, make_scenes
-            from tumortrack_lab.twin.views import VARIANTS, VIEWS
+            from tumortrack_lab.world.twin import VARIANTS, VIEWS, make_scenes
 
-            run = TwinRun(self.case, seed=self.seed)
-            states: tuple[str, ...] = self.states or tuple(VARIANTS)
-            made = make_scenes(run, self.scenes, states, self.views or VIEWS, report)
+            made = make_scenes(
+                self.case, self.scenes, self.states or tuple(VARIANTS), self.views or VIEWS,
+                self.seed, report,
+            )  # fmt: skip
         say(f"{len(made)} scenes in {self.scenes}; look at the scene.png in each.")

@@ -1,2 +1,2 @@
-"""Many patients at once: the steps for each (``steps``), how they are run (``engine``), and the
-tables made of them (``results``)."""
+"""Many patients: the list (``patients``), the steps for each (``steps``), results by content and
+their execution (``run``), and the tables made of them (``results``)."""

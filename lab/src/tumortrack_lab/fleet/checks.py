@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from tumortrack.core.geometry import transform_points, unit
+from tumortrack.core.mesh_query import surface_samples
 from tumortrack.core.organ import KIDNEY
 from tumortrack.core.patient import UNKNOWN
 from tumortrack.core.types import Mesh
@@ -17,9 +18,10 @@ from tumortrack.imaging.case import Case
 from tumortrack.imaging.volume import read_raw
 from tumortrack.registration.rest_shape import long_axis_mm
 from tumortrack.report.metrics import distance_to_surface
-from tumortrack_lab.real.kidneys import ORGAN_ML, TUMOR_ML, kind_of, outer_share
 
 _ORGAN_AT_ALL_ML = {True: (30.0, 1500.0), False: (10.0, 4000.0)}  # a kidney, another
+_ORGAN_ML, _TUMOR_ML = (100.0, 400.0), (1.0, 100.0)  # usual
+_NEAR_MM = 2.0  # of the organ's outer surface
 _POLE = 1 / 3  # of the organ's length, at either end
 _SLICE_MM = 5.0
 # Notes of `prepare` on most inputs; any other note is for a person to look at.
@@ -73,24 +75,29 @@ def _placed(tumor: Mesh, organ: Mesh) -> dict[str, Any]:
     along = organ.vertices_mm @ axis
     share = float((middle @ axis - along.min()) / np.ptp(along))
     position = "lower pole" if share < _POLE else "upper pole" if share > 1 - _POLE else "middle"
-    outer = outer_share(tumor, organ)
+    outer = _outer_share(tumor, organ)
     return {
         "longest_mm": round(float(tumor.longest_mm), 2),
         "depth_mm": round(float(distance_to_surface(middle[None], organ)[0]), 2),
         "outer_share": round(outer, 3),
-        "kind": kind_of(outer),
+        "kind": "endophytic" if outer < 0.25 else "exophytic" if outer >= 0.5 else "between",
         "position": position,
     }
 
 
+def _outer_share(tumor: Mesh, organ: Mesh) -> float:
+    """The share of a tumor's surface near the organ's outer one."""
+    points_mm, area_mm2 = surface_samples(tumor)
+    near = distance_to_surface(points_mm, organ) <= _NEAR_MM
+    return float(area_mm2[near].sum() / area_mm2.sum())
+
+
 def failures(numbers: dict[str, Any], cut_off: bool) -> list[str]:
     """Why the case must not be used; empty: it passes."""
-    low, high = _ORGAN_AT_ALL_ML[numbers["organ"] == KIDNEY.name]
+    (low, high), ml = _ORGAN_AT_ALL_ML[numbers["organ"] == KIDNEY.name], numbers["organ_ml"]
     reasons = {
         "organ or tumor reach the border of the volume: they are cut off": cut_off,
-        f"the organ has {numbers['organ_ml']:.0f} ml; allowed: {low:g} to {high:g}": not (
-            low <= numbers["organ_ml"] <= high
-        ),
+        f"the organ has {ml:.0f} ml; allowed: {low:g} to {high:g}": not low <= ml <= high,
         "there is no tumor": not numbers["tumors"],
     }
     return [words for words, failed in reasons.items() if failed]
@@ -98,13 +105,16 @@ def failures(numbers: dict[str, Any], cut_off: bool) -> list[str]:
 
 def doubts(case: Case, numbers: dict[str, Any]) -> list[str]:
     """What a person should look at."""
-    largest = max(tumor["ml"] for tumor in numbers["tumors"])
+    kind, organ_ml, slice_mm = case.anatomy.kind, numbers["organ_ml"], numbers["slice_mm"]
+    largest_ml = max(tumor["ml"] for tumor in numbers["tumors"])
+    unusual = kind.name == KIDNEY.name and not _ORGAN_ML[0] <= organ_ml <= _ORGAN_ML[1]
     reasons = {
-        "the side is unknown": case.anatomy.kind.in_pairs and numbers["side"] == UNKNOWN,
-        f"the organ has {numbers['organ_ml']:.0f} ml": case.anatomy.kind.name == KIDNEY.name
-        and not (ORGAN_ML[0] <= numbers["organ_ml"] <= ORGAN_ML[1]),
-        f"the largest tumor has {largest:.1f} ml": not TUMOR_ML[0] <= largest <= TUMOR_ML[1],
-        f"slices of {numbers['slice_mm']:g} mm": numbers["slice_mm"] > _SLICE_MM,
+        "the side is unknown": kind.in_pairs and numbers["side"] == UNKNOWN,
+        f"the organ has {organ_ml:.0f} ml": unusual,
+        f"the largest tumor has {largest_ml:.1f} ml": not (
+            _TUMOR_ML[0] <= largest_ml <= _TUMOR_ML[1]
+        ),
+        f"slices of {slice_mm:g} mm": slice_mm > _SLICE_MM,
     }
     notes = [note for note in case.report["notes"] if not _USUAL.search(note)]
     return [words for words, doubted in reasons.items() if doubted] + notes

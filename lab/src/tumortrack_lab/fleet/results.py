@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -13,10 +12,9 @@ import pandas as pd
 
 from tumortrack.core import store
 from tumortrack.core.store import write_atomically, writing
-from tumortrack_lab.fleet.engine import Outcome
-from tumortrack_lab.fleet.list import Patient
-from tumortrack_lab.fleet.pictures import thumbnail
-from tumortrack_lab.fleet.store import DamagedError, Store
+from tumortrack_lab.fleet.patients import Patient
+from tumortrack_lab.fleet.run import Outcome
+from tumortrack_lab.fleet.steps import chain, thumbnail
 
 SCENES, PATIENTS, LOOK, PAGE, PICTURES = (
     "scenes.parquet", "patients.parquet", "look.csv", "index.html", "pictures"
@@ -40,12 +38,12 @@ _COLUMNS = {
 }  # fmt: skip
 _STYLE = (  # beside that of an evaluation's page
     "main { max-width: none; } section { overflow-x: auto; } th, td { text-align: left; "
-    "vertical-align: top; } img { width: 300px; } .look { background: #fff6e0; }"
+    "vertical-align: top; } img { width: 300px; }"
 )
 
 
 def write_results(
-    out: Path, patients: Sequence[Patient], outcomes: Mapping[str, Outcome], held: Store
+    out: Path, patients: Sequence[Patient], outcomes: Mapping[str, Outcome], held: Path
 ) -> None:
     """Write a fleet's tables, page and pictures into ``out``, replacing earlier ones. Patients
     without an outcome are not done yet. Raises StorageError."""
@@ -54,11 +52,23 @@ def write_results(
     rows, scenes, looks = [], [], []
     for patient in patients:
         outcome = outcomes.get(patient.name)
-        row, mine = _read(patient.name, outcome, held)
-        if outcome is not None:
-            _pictures(patient.name, outcome, held, out / PICTURES)
+        row: dict[str, Any] = {"patient": patient.name, "state": "open"}
+        if outcome is not None and outcome.state in ("done", "there"):
+            folder = held / outcome.key[:2] / outcome.key
+            content = store.read_json(folder / "summary.json")
+            mine = [{**row, **line} for line in tumor_lines(content)]
+            for line in mine:
+                del line["state"]
+            row |= {"state": "done", **patient_row(content, mine)}
+            scenes += mine
+            _copy(folder, patient.name, out / PICTURES)
+        elif outcome is not None:
+            row |= {"state": outcome.state, "step": outcome.step, "reason": outcome.reason}
+            picture = chain(patient)["prepare"].place(held) / "qc.png"
+            if picture.is_file():
+                with writing(out):
+                    thumbnail(picture, out / PICTURES / f"{patient.name}.webp")
         rows.append(row)
-        scenes += mine
         looks += [{"patient": patient.name, "reason": why} for why in reasons_to_look(row)]
     for name, lines, columns in ((PATIENTS, rows, _FIRST), (SCENES, scenes, _SCENE)):
         table = pd.DataFrame(lines)
@@ -85,20 +95,6 @@ def reasons_to_look(row: Mapping[str, Any]) -> list[str]:
         worst = f"the worst {row['middle_worst_mm']:.1f} mm off"
         reasons.append(f"{row['over_5_mm']} answers called good over 5 mm off, {worst}")
     return reasons
-
-
-def _read(
-    name: str, outcome: Outcome | None, held: Store
-) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """A patient's row, and those of tumors and scenes."""
-    if outcome is None:
-        return {"patient": name, "state": "open"}, []
-    if outcome.state in ("cannot", "failed"):
-        about = {"state": outcome.state, "step": outcome.step, "reason": outcome.reason}
-        return {"patient": name, **about}, []
-    content = store.read_json(held.get(outcome.task.key) / "summary.json")
-    lines = [{"patient": name, **line} for line in tumor_lines(content)]
-    return {"patient": name, "state": "done", **patient_row(content, lines)}, lines
 
 
 def tumor_lines(content: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
@@ -142,19 +138,11 @@ def patient_row(content: Mapping[str, Any], lines: Sequence[Mapping[str, Any]]) 
     return row
 
 
-def _pictures(name: str, outcome: Outcome, held: Store, out: Path) -> None:
-    """NAME.webp of the case, and NAME-worst.webp; for a patient that failed, only the case."""
-    task = outcome.task
-    with writing(out):
-        if outcome.state in ("done", "there"):
-            folder = held.get(task.key)
-            for kind, place in {"case": f"{name}.webp", "worst": f"{name}-worst.webp"}.items():
-                if (picture := folder / f"{kind}.webp").exists():
-                    write_atomically(out / place, picture.read_bytes())
-            return
-        with suppress(DamagedError):  # it was not prepared
-            if (picture := held.get(task.inputs["case"].key) / "qc.png").exists():
-                thumbnail(picture, out / f"{name}.webp")
+def _copy(folder: Path, name: str, out: Path) -> None:
+    """NAME.webp of the case, and NAME-worst.webp."""
+    for kind, place in {"case": f"{name}.webp", "worst": f"{name}-worst.webp"}.items():
+        if (picture := folder / f"{kind}.webp").exists():
+            write_atomically(out / place, picture.read_bytes())
 
 
 def _page(
@@ -162,45 +150,34 @@ def _page(
 ) -> str:
     states = [row["state"] for row in rows]
     counts = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states))
-    body = []
+    lines = []
     for row in rows:
         name = row["patient"]
-        why = [entry["reason"] for entry in looks if entry["patient"] == name]
-        cells = "".join(f"<td>{html.escape(_cell(row.get(key)))}</td>" for key in _COLUMNS)
-        images = "".join(
-            f'<a href="{PICTURES}/{path.name}"><img loading="lazy" src="{PICTURES}/{path.name}"'
-            f' alt="{path.stem}"></a>'
-            for path in (pictures / f"{name}.webp", pictures / f"{name}-worst.webp")
-            if path.exists()
-        )
-        reasons = f"<br>{'<br>'.join(map(html.escape, why))}" if why else ""
-        mark = ' class="look"' if why else ""
-        body.append(f"<tr{mark} id={name!r}>{cells}</tr>")
-        body.append(f'<tr{mark}><td colspan="{len(_COLUMNS)}">{images}{reasons}</td></tr>')
-    head = "".join(f"<th>{words}</th>" for words in _COLUMNS.values())
-    lines = "\n".join(body)
+        line = {words: _cell(row.get(key)) for key, words in _COLUMNS.items()}
+        why = [html.escape(entry["reason"]) for entry in looks if entry["patient"] == name]
+        images = [f"{PICTURES}/{name}{kind}.webp" for kind in ("", "-worst")]
+        shown = [
+            f'<a href="{image}"><img loading="lazy" src="{image}" alt="{name}"></a>'
+            for image in images
+            if (pictures.parent / image).exists()
+        ]
+        lines.append({**line, "look": "<br>".join(why), "pictures": " ".join(shown)})
+    table = pd.DataFrame(lines).to_html(index=False, escape=False, border=0)
     report = resources.files("tumortrack.report").joinpath("page.html").read_text("utf-8")
     style = report.split("<style>")[1].split("</style>")[0] + _STYLE
-    people = len({entry["patient"] for entry in looks})
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>tumortrack: a fleet</title><style>{style}</style></head><body>"
-        f"<header><h1>{_patients(len(rows))}: {counts}</h1><p>tumortrack: a fleet</p></header>"
+        f"<header><h1>{len(rows)} patients: {counts}</h1><p>tumortrack: a fleet</p></header>"
         '<main><section class="notice"><b>For research use only.</b> Not a medical device.'
-        f"</section><section><p>To be looked at by a person: {_patients(people)} (shaded; {LOOK}). "
-        "Shares are of scenes; errors are medians over answers called good; pictures: the case, "
-        "and the answer that is farthest off.</p>"
-        f"<table><thead><tr>{head}</tr></thead><tbody>\n{lines}\n</tbody></table>"
-        "</section></main></body></html>\n"
+        f"</section><section><p>look: what a person should see ({LOOK}). Shares are of scenes; "
+        "errors are medians over answers called good; pictures: the case, and the answer that is "
+        f"farthest off.</p>{table}</section></main></body></html>\n"
     )
-
-
-def _patients(number: int) -> str:
-    return f"{number} patient{'s' * (number != 1)}"
 
 
 def _cell(value: Any) -> str:
     if value is None or (isinstance(value, float) and pd.isna(value)):
         return "–"
-    return f"{value:.2f}" if isinstance(value, float) else str(value)
+    return f"{value:.2f}" if isinstance(value, float) else html.escape(str(value))

@@ -1,8 +1,7 @@
 """Steps for one patient: prepare -> check -> simulated states -> margins and evaluation -> summary.
 
-Each function is a ``Work``: it calls what the commands call, and writes the same bits wherever and
-whenever it runs, so no times, paths or file names (which `tumortrack margins` writes). The engine
-records costs.
+Each is a ``run.Work``: it calls what the commands call, and writes the same bits wherever and
+whenever it runs, so no times, paths or file names.
 """
 
 from __future__ import annotations
@@ -11,9 +10,12 @@ import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
+import numpy as np
+from PIL import Image
 
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, TumortrackError
@@ -21,56 +23,52 @@ from tumortrack.core.rigid_fit import matched_vertices
 from tumortrack.imaging import prepare as preparing
 from tumortrack.imaging.case import Case, load_case, save_case
 from tumortrack.imaging.options import PrepareOptions
-from tumortrack.report.pictures import qc_picture
+from tumortrack.models.model import Model
+from tumortrack.report.pictures import qc_picture, scene_picture
+from tumortrack.report.protocol import evaluate_scene
 from tumortrack.simulate.scene_folder import read_scene
 from tumortrack.tracking.bound_factor import NAME, write_factor
 from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack.tracking.model_files import case_model, load_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.fleet import checks
-from tumortrack_lab.fleet.list import Patient, hashed
-from tumortrack_lab.fleet.pictures import thumbnail, worst_picture
-from tumortrack_lab.fleet.task import File, Task
-from tumortrack_lab.margins.factor import Locating, found_factor, list_states
-from tumortrack_lab.margins.table import head_of, open_table
-from tumortrack_lab.real.judging import judge
-from tumortrack_lab.tets import lattice
-from tumortrack_lab.twin.apparatus import bench_from_ct
-from tumortrack_lab.world.scenes import World, WorldConfig, simplified
+from tumortrack_lab.fleet.patients import Patient, hashed
+from tumortrack_lab.fleet.run import File, Step, Work
+from tumortrack_lab.judging import judge
+from tumortrack_lab.margins import Locating, found_factor, head_of, list_states, open_table
+from tumortrack_lab.world.scenes import World, WorldConfig, bench_from_ct, simplified
+from tumortrack_lab.world.tets import lattice
 
 # Those of the wider world but for cut organs, which are not located any more.
 FAMILIES = ("rest", "plate", "clamp", "twist", "pull", "tether", "roll")
 _TEST = len(FAMILIES) * 100_000  # number of the first state that is evaluated on
-_VERSIONS = {"evaluate": 5, "margins": 4}  # of other steps: 3
+_VERSIONS = {"evaluate": 6, "margins": 5}  # of other steps: 4
+_WIDTH = 720  # pixels
 Inputs = Mapping[str, Path]
 Given = Mapping[str, Any]
 
 
-def chain(patient: Patient) -> dict[str, Task]:
-    """The patient's tasks by step, each after those that it needs; ``summary`` is the wanted one.
+def chain(patient: Patient) -> dict[str, Step]:
+    """The patient's steps by name, each after those that it needs; ``summary`` is the wanted one.
 
-    A task makes a group of states, one of each family, so that a later run with more states keeps
-    the earlier groups. Evaluation and margins never share a state. The input's content is part of
-    the seed: a state's number alone would give every patient the same load, view and sensor errors.
+    States come in groups, one of each family, so that a later run with more states keeps the
+    earlier groups. Evaluation and margins never share a state. The input's content is part of the
+    seed: a state's number alone would give every patient the same load, view and sensor errors.
     """
-    steps: dict[str, Task] = {}
-    source = hashed(patient.source)
+    steps: dict[str, Step] = {}
+    source = hashed(patient.input)
 
-    def add(
-        name: str, work: Any, options: Given, inputs: Mapping[str, Task | File], memory_mb: int
-    ) -> Task:
+    def add(name: str, work: Work, options: Given, inputs: Mapping[str, Step | File]) -> Step:
         kind = name.rstrip("0123456789-")
-        version = _VERSIONS.get(kind, 3)
-        steps[name] = Task(patient.name, kind, version, work, dict(options), inputs, memory_mb)
+        steps[name] = Step(kind, _VERSIONS.get(kind, 4), work, dict(options), inputs)
         return steps[name]
 
-    kind = "" if patient.source.is_dir() else "".join(patient.source.suffixes[-2:])
+    kind = "" if patient.input.is_dir() else "".join(patient.input.suffixes[-2:])
     given = {key: list(v) if isinstance(v, tuple) else v for key, v in patient.prepare.items()}
-    case = add("prepare", prepare, {**given, "suffix": kind}, {"source": source}, 3000)
+    case = add("prepare", prepare, {**given, "suffix": kind}, {"source": source})
     series = {"series": patient.prepare.get("series")}
-    checked = add("check", check, series, {"case": case, "source": source}, 2000)
-    after = {"case": case, "check": checked}
-    groups: dict[str, dict[str, Task | File]] = {"margins": {}, "test": {}}
+    after = {"case": case, "check": add("check", check, series, {"case": case, "source": source})}
+    groups: dict[str, dict[str, Step | File]] = {"margins": {}, "test": {}}
     drawn = hashlib.sha256(f"{source.key} {patient.seed}".encode()).hexdigest()
     counts = {"margins": (0, patient.margin_states, 1)}
     counts["test"] = _TEST, patient.test_states, patient.views
@@ -81,13 +79,17 @@ def chain(patient: Patient) -> dict[str, Task]:
                 "seed": int(drawn[:8], 16),
             }  # fmt: skip
             name = f"states-{kind}-{len(groups[kind])}"
-            groups[kind][f"states_{len(groups[kind]):04d}"] = add(name, states, here, after, 1500)
-    known, method = {"case": case, **groups["margins"]}, {"fingerprint": fingerprint()}
-    margin = add("margins", margins, {"seed": patient.seed, **method}, known, 1500)
-    judged = add("evaluate", evaluate, method, {"case": case, **groups["test"]}, 1500)
-    results = {**after, "margins": margin, "evaluate": judged}
-    add("summary", summary, {}, {**results, **groups["test"]}, 1500)
+            groups[kind][f"states_{len(groups[kind]):04d}"] = add(name, states, here, after)
+    method = {"fingerprint": fingerprint()}
+    known = {"case": case, **groups["margins"]}
+    margin = add("margins", margins, {"seed": patient.seed, **method}, known)
+    judged = add("evaluate", evaluate, method, {"case": case, **groups["test"]})
+    add("summary", summary, {}, {**after, "margins": margin, "evaluate": judged, **groups["test"]})
     return steps
+
+
+def summary_of(patient: Patient) -> Step:
+    return chain(patient)["summary"]
 
 
 def prepare(inputs: Inputs, options: Given, out: Path) -> None:
@@ -125,32 +127,28 @@ def states(inputs: Inputs, options: Given, out: Path) -> None:
     world = World.of(case, sha256, config, lattice(there, config.edge_mm))
     failures = {}
     for number in range(options["first"], options["first"] + options["count"]):
-        family, _ = world.recipe(number)
-        try:
-            scene = world.scene(number)
-            scene.write(out / f"{number:06d}-{family}-0")
-        except TumortrackError as error:
-            failures[f"{number:06d}-{family}-0"] = f"{type(error).__name__}: {error}"
-            continue
-        for view in range(1, options["views"]):
-            name = f"{number:06d}-{family}-{view}"
+        shown = None
+        for view in range(options["views"]):
+            name = f"{number:06d}-{world.family(number)}-{view}"
             try:
-                shown = world.kept(scene)
-                world.again(shown, number * 1000 + view, "none").write(out / name)
+                shown = shown or world.shown(number)
+                again = number * 1000 + view
+                scene = world.again(shown, again) if view else world.first(shown)
             except TumortrackError as error:
                 failures[name] = f"{type(error).__name__}: {error}"
+                if not view:
+                    break
+            else:
+                scene.write(out / name)
     store.write_json(out / "failures.json", failures)
 
 
 def margins(inputs: Inputs, options: Given, out: Path) -> None:
-    """margins.jsonl, a line for each state, as `tumortrack margins` writes it; result.json; and
-    with enough states bound_factor.json, which belongs into the model's folder.
-
-    result.json: ``states``; ``answers``, the good ones; ``bound_factor``, by which their bounds are
-    to be multiplied; or the ``reason`` why it is not known; ``largest_ratio`` of what an answer is
-    off to its bound; ``holds_for``, the chance that one more exchangeable answer has no larger one:
-    n / (n + 1).
-    """
+    """margins.jsonl, a line for each state, as `tumortrack margins` writes it; with enough states
+    bound_factor.json, which belongs into the model's folder; and result.json: ``states``;
+    ``answers``, the good ones; ``bound_factor``, or the ``reason`` why it is not known;
+    ``largest_ratio`` of what an answer is off to its bound; ``holds_for``, the chance that one more
+    exchangeable answer has no larger one: n / (n + 1)."""
     model = inputs["case"] / Case.MODEL
     seed, digest = options["seed"], store.sha256_of(model / store.MANIFEST)
     locating, rows = Locating(Tracker(load_model(model)), seed), []
@@ -193,7 +191,7 @@ def evaluate(inputs: Inputs, options: Given, out: Path) -> None:
             about = {"scene": path.name, "state": int(number), "family": family, "view": int(view)}
             about |= {name: scene.meta[name] for name in ("hidden_share", "visible_share")}
             about["segmentation"] = scene.meta["segmentation"]["kind"]
-            rows.append(about | judge(tracker, anatomy, scene, scene.depth))
+            rows.append(about | judge(tracker, anatomy, scene))
     store.write_json(out / "rows.json", {"rows": rows, "failures": failures})
 
 
@@ -208,7 +206,35 @@ def summary(inputs: Inputs, options: Given, out: Path) -> None:
     content = {"check": checked, "margins": result, "model": model, **judged}
     store.write_json(out / "summary.json", content)
     thumbnail(inputs["case"] / "qc.png", out / "case.webp")
-    worst_picture(inputs["case"], list(_groups(inputs)), judged["rows"], out / "worst.webp")
+    if judged["rows"]:
+        name = max(judged["rows"], key=_far)["scene"]
+        [folder] = [group / name for group in _groups(inputs) if (group / name).is_dir()]
+        _worst_picture(load_model(inputs["case"]), folder, out / "worst.webp")
+
+
+def _far(row: dict[str, Any]) -> tuple[int, float]:
+    """Good answers first, then the largest error."""
+    errors = [tumor.get("middle_mm", -np.inf) for tumor in row["tumors"]]
+    return ["refused", "poor", "good"].index(row["verdict"]), max(errors, default=-np.inf)
+
+
+def _worst_picture(model: Model, folder: Path, out: Path) -> None:
+    """The estimate, if there is one, over the truth."""
+    scene, tracker = read_scene(folder), Tracker(model)
+    entry, estimate = evaluate_scene(
+        lambda cloud: tracker.locate(cloud, seen=scene.depth), scene, folder.name
+    )
+    with TemporaryDirectory() as aside:
+        shown = estimate.meshes if estimate else {}
+        scene_picture(scene, shown, entry, Path(aside) / "scene.png")
+        thumbnail(Path(aside) / "scene.png", out)
+
+
+def thumbnail(source: Path, out: Path) -> None:
+    """A picture, no wider than ``_WIDTH``, as WebP."""
+    with Image.open(source) as image:
+        size = min(_WIDTH, image.width), round(image.height * min(1, _WIDTH / image.width))
+        image.convert("RGB").resize(size).save(out, "WEBP", quality=80)
 
 
 def _groups(inputs: Inputs) -> Iterator[Path]:

@@ -1,17 +1,14 @@
-"""A wider world: scenes to calibrate and test bounds on, with other physics, other noise and other
-views than the default method's own simulation, with which they share no code.
+"""Scenes of a wider world, to calibrate and test bounds on: other physics, noise and views than the
+default method's own simulation, with which they share no code; and the digital twin.
 
-``families``: eight families of states (rest, plate, clamp, twist, pull, tether, roll, cut), each
-state one random draw of tissue, bed and load; ``organ`` and ``forces``: the mechanics;
-``segmentation``: how the true organ differs from the case; ``noise``: another stereo camera;
-``views``: directions, hands, instruments, fat, and the organ as tracking finds it; ``scenes``: all
-of it by number. A scene is one view of one state. ``lab/scripts/world.py`` (`make
-world`) writes and measures them.
+``tets``, ``solid``, ``equilibrium``, ``forces``, ``organ``: finite elements. ``families``: eight
+families of states, each one random draw of tissue, bed and load; ``twin``: the states of the
+paper's bench, and `tumortrack twin`. ``segmentation``: how the true organ differs from the case;
+``noise``: another stereo camera; ``views``: directions, hands, instruments, fat, and the organ as
+tracking finds it; ``scenes``: all of it by number (`make world`); ``evidence``: drawn from a
+scene's truth. ``cut``: a plan cuts the true organ.
 
-``paths``: moving organs; ``films``: depth images of them, and the truth; ``following``: how
-followers do. ``lab/scripts/sequences.py`` (`make sequences`).
-
-The solid and its solver are the twin's (``twin.solid``, ``twin.equilibrium``). What is still
-missing: vessels, fat and neighbours as bodies of their own, blood and perfusion, hands that touch
-the organ they hide (what deforms it is mostly not in the picture), motion within a frame.
+What is still missing: vessels, fat and neighbours as bodies of their own, blood and perfusion,
+hands that touch the organ they hide (what deforms it is mostly not in the picture), motion within a
+frame.
 """

@@ -18,7 +18,6 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
 from tumortrack.core.config import Config
-from tumortrack.core.errors import InputError
 from tumortrack.core.evidence import Evidence, Free, Held, Landmark, Outline, Touch
 from tumortrack.core.geometry import perpendicular, plane_section, triangles_of, turned_by, unit
 from tumortrack.core.mesh_query import contains
@@ -59,10 +58,6 @@ class EvidenceErrors(Config, frozen=True, kw_only=True):
 
 ERRORS = EvidenceErrors()
 ALL_TRUE = EvidenceErrors(false_contacts=0.0, slips=0.0)
-EXACT = EvidenceErrors(
-    tip_mm=0.0, hand_eye_mm=(0.0, 0.0), hand_eye_degrees=0.0, probe_mm=0.0, click_mm=0.0,
-    grip_mm=0.0, false_contacts=0.0, slips=0.0,
-)  # fmt: skip
 _LEAST_STD_MM = 0.05  # that evidence may state
 
 
@@ -121,12 +116,7 @@ class EvidenceSource:
 
     def drawn(self, numbers: Mapping[str, int]) -> list[Piece]:
         """So many pieces of each kind (touch, landmark, held, free, plane), at random; of outlines,
-        so many of each tumor. Raises InputError: the scene has no points to recognise or hold."""
-        if self.scene.targets is None and numbers.keys() & {"landmark", "held"}:
-            raise InputError(
-                "landmarks and held points need targets.csv, which says where points of the CT "
-                "are; this scene has none."
-            )
+        so many of each tumor."""
         tumors = len(self.scene.reference.tumors)
         outlines = [self.outline(n % tumors) for n in range(tumors * numbers.get("outline", 0))]
         return [

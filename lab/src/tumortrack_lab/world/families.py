@@ -1,7 +1,7 @@
 """Deformed states of one organ on the bench: families of loads, each state one random draw of
 material, bed and load.
 
-Beyond the twin's bench: soft to hard beds with a rim, friction, an organ that is free to
+Beyond the twin: soft to hard beds with a rim, friction, an organ that is free to
 roll, vessels, grips that twist, clamp or pull, a slit that is pulled open, tissue that is uneven
 and has a capsule. Ranges are assumptions, wide on purpose, where no source stands beside them.
 """
@@ -18,11 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.geometry import perpendicular, unit
-from tumortrack_lab.tets import Embedding, TetMesh, find
-from tumortrack_lab.twin import equilibrium
-from tumortrack_lab.twin.apparatus import GRAVITY_KPA_PER_MM
-from tumortrack_lab.twin.equilibrium import ContactPlate, Nodes, Points, Rod
-from tumortrack_lab.twin.solid import NeoHookeanSolid
+from tumortrack_lab.world.equilibrium import ContactPlate, Nodes, Points, Rod, find_equilibrium
 from tumortrack_lab.world.forces import (
     Capsule,
     Force,
@@ -35,12 +31,14 @@ from tumortrack_lab.world.forces import (
     rows_of,
 )
 from tumortrack_lab.world.organ import Generator, Organ, Slit, Stage, Vector, Wound, cut_open
+from tumortrack_lab.world.solid import NeoHookeanSolid
+from tumortrack_lab.world.tets import TetMesh, find
 
-LARGEST_CHANGE, NEARLY_NONE = 0.05, 0.02  # of volume; from Poisson's ratio 0.49 on the second
+_LARGEST_CHANGE, _NEARLY_NONE = 0.05, 0.02  # of volume; from Poisson's ratio 0.49 on the second
 BED_DEPTH_MM = 15.0  # of fat under the organ: what turns the bed's modulus into stiffness
 GRIP_MN_MM = 4000.0  # of a grip, over all its points
 _STEP_MM = 6.0  # of a load, at a time
-_GRAVITY = 1050.0 * GRAVITY_KPA_PER_MM  # of soft tissue, mN/mm3
+GRAVITY_MN_MM3 = 1050.0 * 9.81e-6  # of soft tissue
 _ITERATIONS = 400  # a step; with more it mostly does not converge either
 _CLEAR_MM = 6.0  # between a slit and every tumor: as wide as a tetrahedron
 
@@ -67,26 +65,26 @@ def _plate(stage: Stage, rng: Generator) -> Load:
     out = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
     width, deep = rng.uniform(12, 60), rng.uniform(3, 0.3 * stage.organ.size_mm[2])
     target = stage.organ.place(rng, 0.0)
-    axes = frame_along(out, rng)
+    axes = _frame_along(out, rng)
 
     def at(share: float) -> list[Force]:
-        return [stage.touch(plate_over(stage, axes, target, width, share * deep))]
+        return [stage.touch(_plate_over(stage, axes, target, width, share * deep))]
 
     return Load(at, deep, {"plate_tilt_degrees": np.rad2deg(tilt), "width_mm": width, "mm": deep})
 
 
-def clamp(stage: Stage, rng: Generator) -> Load:
+def _clamp(stage: Stage, rng: Generator) -> Load:
     """Two plates from opposite sides, about level."""
     turn, width = rng.uniform(0, 2 * np.pi), rng.uniform(15, 60)
     out = unit(np.array([np.cos(turn), np.sin(turn), rng.uniform(-0.2, 0.2)]))
     thick = float(np.ptp(stage.organ.points_mm @ out))
     deep = rng.uniform(2.0, 0.14 * min(thick, 80.0), 2)
-    target, axes = stage.organ.place(rng), frame_along(out, rng)
+    target, axes = stage.organ.place(rng), _frame_along(out, rng)
     back = axes * [-1.0, 1.0, -1.0]
 
     def at(share: float) -> list[Force]:
         sides = zip((axes, back), deep, strict=True)
-        plates = [plate_over(stage, way, target, width, share * mm) for way, mm in sides]
+        plates = [_plate_over(stage, way, target, width, share * mm) for way, mm in sides]
         return [stage.touch(plate) for plate in plates]
 
     return Load(at, float(deep.sum()), {"width_mm": width, "mm": deep.tolist()})
@@ -121,11 +119,8 @@ def _pull(stage: Stage, rng: Generator) -> Load:
         middle = organ.place(rng, 0.3)
         held = np.argsort(np.linalg.norm(mesh.nodes_mm - middle, axis=1))[:12]
     out = unit(unit(middle - organ.middle_mm) + rng.normal(0, 0.6, 3) + [0, 0, 0.4])
-    far_mm, corners = rng.uniform(4.0, 16.0), np.zeros((len(held), 4))
-    corners[:, 0] = 1.0
-    rows = rows_of(
-        Embedding(np.tile(held[:, None], (1, 4)).astype(np.int32), corners), len(mesh.nodes_mm)
-    )
+    far_mm = rng.uniform(4.0, 16.0)
+    rows = rows_of(held[:, None], np.ones((len(held), 1)), len(mesh.nodes_mm))
 
     def at(share: float) -> list[Force]:
         places = mesh.nodes_mm[held] + share * far_mm * out
@@ -151,7 +146,7 @@ def _tether(stage: Stage, rng: Generator) -> Load:
     return Load(at, max(pull, deep), about, free=True)
 
 
-def roll(stage: Stage, rng: Generator) -> Load:
+def _roll(stage: Stage, rng: Generator) -> Load:
     """A flank is drawn sideways over a slippery bed: the organ is free to roll about its length."""
     organ, far_mm = stage.organ, rng.uniform(5.0, 18.0)
     out = unit(np.array([rng.normal(0, 0.2), rng.choice([-1.0, 1.0]), rng.uniform(0.3, 1.0)]))
@@ -181,7 +176,7 @@ def _cut(stage: Stage, rng: Generator) -> Load:
     return Load(at, open_mm, {"open_mm": open_mm, "slit_radius_mm": radius})
 
 
-def frame_along(out: Vector, rng: Generator) -> Float64[np.ndarray, "3 3"]:
+def _frame_along(out: Vector, rng: Generator) -> Float64[np.ndarray, "3 3"]:
     """A frame whose z is that direction, turned about it at random."""
     side = perpendicular(out)
     angle = rng.uniform(0, 2 * np.pi)
@@ -189,7 +184,7 @@ def frame_along(out: Vector, rng: Generator) -> Float64[np.ndarray, "3 3"]:
     return np.stack([x, np.cross(out, x), out], axis=1)
 
 
-def plate_over(
+def _plate_over(
     stage: Stage, axes: np.ndarray, target_mm: Vector, width_mm: float, deep_mm: float
 ) -> Turned:
     """A plate across the z of ``axes`` over a target, so deep from where it first touches."""
@@ -215,8 +210,8 @@ def _random_slit(organ: Organ, rng: Generator) -> Slit:
 
 
 FAMILIES: dict[str, Callable[[Stage, Generator], Load] | None] = {
-    "rest": None, "plate": _plate, "clamp": clamp, "twist": _twist, "pull": _pull,
-    "tether": _tether, "roll": roll, "cut": _cut,
+    "rest": None, "plate": _plate, "clamp": _clamp, "twist": _twist, "pull": _pull,
+    "tether": _tether, "roll": _roll, "cut": _cut,
 }  # fmt: skip
 
 
@@ -258,8 +253,11 @@ def solve(organ: Organ, family: str, seed: int) -> Deformed:
     bed_kpa, friction = log_uniform(rng, 0.3, 40.0), rng.choice([0.0, rng.uniform(0.1, 0.8)])
     friction = 0.0 if load.smooth else friction
     down = np.array([*rng.normal(0, 0.3, 2), -1.0]) * log_uniform(rng, 0.2, 3.0)
-    bed, weight = bedded(stage, rim, bed_kpa, friction, down)
-    steady: list[Force] = [bed, weight]
+    under = organ.bed.under(organ.points_mm, rim)
+    steady: list[Force] = [
+        stage.touch(under, bed_kpa / BED_DEPTH_MM, friction),
+        Weight(GRAVITY_MN_MM3 * solid.node_volumes_mm3[:, None] * down),  # beyond the CT's
+    ]
     if not load.free:
         steady.append(Steady.of(solid))
         if rng.uniform() < 0.5:
@@ -283,15 +281,6 @@ def solve(organ: Organ, family: str, seed: int) -> Deformed:
     return Deformed(organ, nodes, mesh.tets, rim, wound, about)
 
 
-def bedded(
-    stage: Stage, rim_mm: float, bed_kpa: float, friction: float, down: Vector
-) -> tuple[Touch, Weight]:
-    """The organ's bed, and weight beyond what it bears in the CT (``down``: in weights)."""
-    under = stage.organ.bed.under(stage.organ.points_mm, rim_mm)
-    bed = stage.touch(under, bed_kpa / BED_DEPTH_MM, friction)
-    return bed, Weight(_GRAVITY * stage.solid.node_volumes_mm3[:, None] * down)
-
-
 def equilibria(
     solid: NeoHookeanSolid, loads: Iterable[tuple[Force, ...]], start_mm: Nodes | None = None
 ) -> tuple[list[Nodes], int]:
@@ -304,7 +293,7 @@ def equilibria(
             if isinstance(force, Touch):
                 force.remember(nodes)
         body = LoadedBody(solid, forces)
-        nodes, convergence = equilibrium.find_equilibrium(body, nodes, _ITERATIONS)
+        nodes, convergence = find_equilibrium(body, nodes, _ITERATIONS)
         iterations += convergence.iterations
         keys.append(nodes)
     return keys, iterations
@@ -313,10 +302,17 @@ def equilibria(
 def volume_change(solid: NeoHookeanSolid, nodes_mm: Nodes) -> float:
     """Relative change of the volume. Raises TumortrackError: more than tissue's."""
     change = float(np.average(solid.stretch(nodes_mm), weights=solid.mesh.volumes_mm3) - 1)
-    limit = LARGEST_CHANGE if solid.poisson < 0.49 else NEARLY_NONE
+    limit = _LARGEST_CHANGE if solid.poisson < 0.49 else _NEARLY_NONE
     if abs(change) > limit:
         raise TumortrackError(f"the organ's volume changed by {change:.1%}, over {limit:.0%}.")
     return change
+
+
+def even_tissue(organ: Organ) -> NeoHookeanSolid:
+    """15 kPa (kidney and soft PVA gels: about 5 to 30), tumors three times as stiff, nearly
+    incompressible."""
+    shear = 15.0 / (2 * (1 + 0.49)) * (1 + 2.0 * organ.in_tumor)
+    return NeoHookeanSolid(organ.mesh, shear, 0.49)
 
 
 def random_tissue(

@@ -1,6 +1,6 @@
 """Forces on an organ of the twin or the wider world, each an energy (uJ) with its gradient (mN) and
 an approximate Hessian (mN/mm); and the organ under them, whose equilibrium is found by
-``twin.equilibrium``. Units: mm, kPa, mN.
+``equilibrium``. Units: mm, kPa, mN.
 """
 
 from __future__ import annotations
@@ -16,13 +16,12 @@ from scipy.sparse import bsr_matrix, csr_matrix, eye, kron
 from tumortrack.core.mesh_query import contains, surface_distance
 from tumortrack.core.types import Mesh
 from tumortrack.native import F64, kernel
-from tumortrack_lab.tets import Embedding, TetMesh
-from tumortrack_lab.twin.equilibrium import Nodes, Points
-from tumortrack_lab.twin.solid import NeoHookeanSolid
+from tumortrack_lab.world.equilibrium import Nodes, Points
+from tumortrack_lab.world.solid import NeoHookeanSolid
+from tumortrack_lab.world.tets import FACES, TetMesh
 
 _STEADY_MN_MM = 2e4
 _STICK_MM = 0.2  # a smaller slip meets less than full friction: keeps the energy smooth
-FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])  # of a tetrahedron, outward
 _GRID_MM, _GRID_ROOM_MM = 2.5, 25.0
 
 # Values of a grid, places in its steps -> cubic B-spline and its gradient.
@@ -46,10 +45,12 @@ class Obstacle(Protocol):
     def distance(self, points_mm: Points) -> tuple[Float64[np.ndarray, " m"], Points]: ...
 
 
-def rows_of(held: Embedding, n_nodes: int) -> csr_matrix:
-    """The matrix that carries nodes (n, 3) to points (m, 3)."""
-    row = np.repeat(np.arange(len(held.nodes)), 4)
-    return csr_matrix((held.weights.ravel(), (row, held.nodes.ravel())), (len(held.nodes), n_nodes))
+def rows_of(
+    nodes: Int[np.ndarray, "m k"], weights: Float[np.ndarray, "m k"], n_nodes: int
+) -> csr_matrix:
+    """The matrix that carries nodes (n, 3) to points (m, 3), each held by some of them."""
+    row = np.repeat(np.arange(len(nodes)), nodes.shape[1])
+    return csr_matrix((weights.ravel(), (row, nodes.ravel())), (len(nodes), n_nodes))
 
 
 def _spread(rows: csr_matrix, blocks: Float64[np.ndarray, "m 3 3"]) -> csr_matrix:
@@ -215,7 +216,7 @@ class Steady(_Soft):
 
 @dataclass(frozen=True, eq=False)
 class LoadedBody:
-    """A solid under forces; see ``twin.equilibrium.Equilibrium``."""
+    """A solid under forces; see ``equilibrium.Equilibrium``."""
 
     solid: NeoHookeanSolid
     forces: tuple[Force, ...]

@@ -1,4 +1,8 @@
-"""One organ on the bench, of one material, perhaps slit, to which loads are applied."""
+"""One organ on the bench, of one material, perhaps slit, to which loads are applied.
+
+Bench frame, mm: z up, towards the camera; the organ lies on z = 0 as in its CT, its long axis along
+x, its middle at x = y = 0.
+"""
 
 from __future__ import annotations
 
@@ -11,14 +15,15 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.types import Anatomy
-from tumortrack_lab.tets import Embedding, TetMesh, find
-from tumortrack_lab.twin.apparatus import contact_points, tumor_share
-from tumortrack_lab.twin.equilibrium import Points
-from tumortrack_lab.twin.solid import NeoHookeanSolid
-from tumortrack_lab.world.forces import FACES, Bed, Obstacle, Springs, Touch, rows_of
+from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.mesh_query import surface_samples
+from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.imaging.raster import label_grid
+from tumortrack_lab.world.equilibrium import Points
+from tumortrack_lab.world.forces import Bed, Obstacle, Springs, Touch, rows_of
+from tumortrack_lab.world.solid import NeoHookeanSolid
+from tumortrack_lab.world.tets import FACES, TetMesh, find
 
-_SAMPLE_MM = 3.0  # one point of contact per cube of this size
 _HARD_KPA_MM = 150.0  # of plates, rods
 
 Generator = np.random.Generator
@@ -75,7 +80,7 @@ def cut_open(mesh: TetMesh, slit: Slit) -> Wound:
 
 @dataclass(frozen=True, eq=False)
 class Organ:
-    """A case on the bench (frame of ``twin.apparatus``) with its tetrahedra."""
+    """A case on the bench with its tetrahedra."""
 
     anatomy: Anatomy
     mesh: TetMesh
@@ -87,9 +92,10 @@ class Organ:
     weights: Float64[np.ndarray, "m 4"]
 
     @classmethod
-    def of(cls, anatomy: Anatomy, mesh: TetMesh) -> Organ:
-        points, areas = contact_points(anatomy.organ, _SAMPLE_MM / 2, _SAMPLE_MM)
-        share = tumor_share(mesh, anatomy) if anatomy.tumors else np.zeros(len(mesh.tets))
+    def of(cls, anatomy: Anatomy, mesh: TetMesh, sample_mm: float = 3.0) -> Organ:
+        """``sample_mm``: one point of contact per cube of this size."""
+        points, areas = _contact_points(anatomy.organ, sample_mm)
+        share = _tumor_share(mesh, anatomy) if anatomy.tumors else np.zeros(len(mesh.tets))
         held = find(mesh.nodes_mm[mesh.tets], points)
         return cls(anatomy, mesh, Bed.of(anatomy.organ), share, points, areas, *held)
 
@@ -123,8 +129,8 @@ class Stage:
 
     def rows(self, points: Any = slice(None)) -> Any:
         """The matrix that carries the solid's nodes to points of the surface."""
-        held = Embedding(self.solid.mesh.tets[self.organ.owner[points]], self.organ.weights[points])
-        return rows_of(held, len(self.solid.mesh.nodes_mm))
+        mesh, organ = self.solid.mesh, self.organ
+        return rows_of(mesh.tets[organ.owner[points]], organ.weights[points], len(mesh.nodes_mm))
 
     def touch(self, obstacle: Obstacle, kpa_mm: float = _HARD_KPA_MM, friction: float = 0) -> Touch:
         return Touch(self.rows(), self.organ.areas_mm2, obstacle, kpa_mm, friction)
@@ -138,3 +144,33 @@ class Stage:
         """Points of the surface held where a shift (one, or one each) brings them."""
         places = self.organ.points_mm[points] + shift_mm
         return Springs(self.rows(points), places, np.full(len(points), mn_mm / len(points)))
+
+
+def moved(anatomy: Anatomy, b_from_a: Float64[np.ndarray, "4 4"]) -> Anatomy:
+    """An anatomy in another frame."""
+    return anatomy.of(
+        part.moved(transform_points(b_from_a, part.vertices_mm)) for part in anatomy.parts
+    )
+
+
+def _contact_points(organ: Mesh, cube_mm: float) -> tuple[Points, Float64[np.ndarray, " m"]]:
+    """One point of the surface per cube that it passes, and the area there."""
+    points_mm, areas_mm2 = surface_samples(organ, cube_mm / 2)
+    cubes = np.floor(points_mm / cube_mm)
+    _, first, cube = np.unique(cubes, axis=0, return_index=True, return_inverse=True)
+    return points_mm[first], np.bincount(cube.ravel(), areas_mm2)
+
+
+def _tumor_share(mesh: TetMesh, anatomy: Anatomy) -> Float64[np.ndarray, " t"]:
+    """Share of each tetrahedron that lies in a tumor, by a voxel grid of 1 mm."""
+    low = np.floor(anatomy.organ.box_mm[0]) - 1
+    shape = np.ceil(anatomy.organ.box_mm[1] - low).astype(int) + 2
+    labels = label_grid(anatomy, rigid(np.eye(3), low), tuple(shape.tolist()))
+    # Fixed points spread over a tetrahedron: corners, edges' middles and centre, pulled inwards.
+    spread = np.concatenate(
+        [np.eye(4), (np.eye(4)[[0, 0, 0, 1, 1, 2]] + np.eye(4)[[1, 2, 3, 2, 3, 3]]) / 2]
+    )
+    weights = np.concatenate([0.75 * spread + 0.0625, np.full((1, 4), 0.25)])
+    points = np.einsum("pk,tkj->tpj", weights, mesh.nodes_mm[mesh.tets])
+    index = np.clip(np.rint(points - low).astype(int), 0, shape - 1)
+    return np.asarray((labels[tuple(index.transpose(2, 0, 1))] > 1).mean(1), np.float64)

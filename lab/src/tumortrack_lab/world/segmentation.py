@@ -13,10 +13,9 @@ from typing import Literal, get_args
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, map_coordinates
 
-from tumortrack.core.geometry import rotation_onto
+from tumortrack.core.geometry import rotation_onto, triangles_of
 from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack_lab.peers.pose_search import vertex_normals
 
 Kind = Literal["none", "voxel", "slices", "reader"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -47,7 +46,7 @@ def perturbed(
         shifts = [_disagreement(part, reach, rng) for part in anatomy.parts]
         about = {"reach_mm": reach}
     parts = tuple(
-        part.moved(part.vertices_mm + shift[:, None] * vertex_normals(part))
+        part.moved(part.vertices_mm + shift[:, None] * _vertex_normals(part))
         for part, shift in zip(anatomy.parts, shifts, strict=True)
     )
     rms = [float(np.sqrt((shift**2).mean())) for shift in shifts]
@@ -77,7 +76,7 @@ def _sliced(mesh: Mesh, thick_mm: float, phase: float, axis: np.ndarray) -> np.n
     smooth = gaussian_filter1d(stairs, thick_mm / 2 / _GRID_MM, axis=2)
     for across in (0, 1):  # the drawn line's own pixels
         smooth = gaussian_filter1d(smooth, 1.0 / _GRID_MM, axis=across)
-    out = vertex_normals(mesh) @ turn.T
+    out = _vertex_normals(mesh) @ turn.T
     steps = np.arange(-_REACH_MM, _REACH_MM + 0.1, 0.25)
     places = (there[:, None] + steps[:, None] * out[:, None] - low) / _GRID_MM
     value = map_coordinates(smooth, places.reshape(-1, 3).T, order=1).reshape(len(there), -1)
@@ -88,3 +87,12 @@ def _sliced(mesh: Mesh, thick_mm: float, phase: float, axis: np.ndarray) -> np.n
     a, b = value[row, best], value[row, best + 1]
     shift = steps[best] + 0.25 * (a - 0.5) / np.maximum(a - b, 1e-6)
     return np.where(np.isfinite(away.min(1)), shift, 0.0)
+
+
+def _vertex_normals(mesh: Mesh) -> np.ndarray:
+    """Outward unit normals: the mean of each vertex's triangles, by area."""
+    normals = np.zeros_like(mesh.vertices_mm)
+    doubled = triangles_of(mesh.vertices_mm, mesh.faces)[1]
+    for corner in mesh.faces.T:
+        np.add.at(normals, corner, doubled)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)

@@ -18,13 +18,13 @@ from tumortrack.sense.camera import d405
 from tumortrack.sense.cloud import CloudConfig
 from tumortrack.sense.region import Hints, RegionConfig, organ_points
 from tumortrack.sense.render import render_depth
-from tumortrack_lab.twin.equilibrium import Rod
-from tumortrack_lab.twin.occluders import ellipsoid, rod_mesh
+from tumortrack_lab.world.equilibrium import Rod
 from tumortrack_lab.world.families import Deformed, log_uniform
 from tumortrack_lab.world.noise import StereoCamera, StereoConfig
+from tumortrack_lab.world.occluders import ellipsoid, rod_mesh
 
-SIZE_PX = (424, 240)
-_NEAR_MM, FAR_MM = (85.0, 230.0), 420.0  # of the organ's nearest point; nothing is seen beyond
+_SIZE_PX = (424, 240)
+_NEAR_MM, _FAR_MM = (85.0, 230.0), 420.0  # of the organ's nearest point; nothing is seen beyond
 _MOST_TILT = 60.0  # degrees from straight above
 _DEEPER_MM = 15.0  # behind a slit's film: seen through a gap between coarse walls
 
@@ -48,25 +48,25 @@ def look(
 ) -> View:
     """One random view of the state's true surface (bench frame) and of other objects. ``hidden``:
     the share of the organ's pixels that a hand or instruments hide."""
-    camera = d405(*SIZE_PX)
+    camera = d405(*_SIZE_PX)
     to_camera, about = _camera_pose(organ, rng)
     alone = _organ_depth(state, organ, to_camera, camera)
-    below = render(ground_mesh(state.rim_mm, rng), to_camera, camera)
-    others = [render(mesh, to_camera, camera) for mesh in (*beside, *_beside(organ, rng))]
+    below = _render(_ground_mesh(state.rim_mm, rng), to_camera, camera)
+    others = [_render(mesh, to_camera, camera) for mesh in (*beside, *_beside(organ, rng))]
     scene = np.fmin.reduce([alone, below, *others])
     own = np.isfinite(alone) & (alone <= scene)
     if hidden > 0 and own.any():
-        at, share, about["occluder"] = covering(alone, own, camera, hidden, rng)
-        scene = np.fmin(scene, render(at(share), np.eye(4), camera))
+        at, share, about["occluder"] = _covering(alone, own, camera, hidden, rng)
+        scene = np.fmin(scene, _render(at(share), np.eye(4), camera))
     visible = own & (alone <= scene)
-    scene[scene > FAR_MM] = np.nan
+    scene[scene > _FAR_MM] = np.nan
     sensor = StereoConfig(subpixel_px=rng.uniform(0.03, 0.12), gloss_degrees=rng.uniform(2.0, 7.0))
     frame = StereoCamera(camera, sensor, rng).see(scene.astype(np.float32))
     wide = Intrinsics(
-        *(2 * SIZE_PX[0], 2 * SIZE_PX[1]), camera.fx, camera.fy,
-        camera.cx + SIZE_PX[0] / 2, camera.cy + SIZE_PX[1] / 2,
+        *(2 * _SIZE_PX[0], 2 * _SIZE_PX[1]), camera.fx, camera.fy,
+        camera.cx + _SIZE_PX[0] / 2, camera.cy + _SIZE_PX[1] / 2,
     )  # fmt: skip
-    every = max(int(np.isfinite(render(organ, to_camera, wide)).sum()), 1)
+    every = max(int(np.isfinite(_render(organ, to_camera, wide)).sum()), 1)
     about |= {
         "hidden_wanted": hidden,
         "hidden_share": 1 - float(visible.sum() / max(own.sum(), 1)),
@@ -95,33 +95,18 @@ def _camera_pose(organ: Mesh, rng: Generator) -> tuple[Transform, dict[str, Any]
     middle."""
     tilt = min(abs(rng.normal(0, 25.0)), _MOST_TILT)
     turn, roll = rng.uniform(0, 2 * np.pi, 2)
-    near = log_uniform(rng, *_NEAR_MM)
-    pose = pose_before(organ, facing(direction(tilt, turn), roll), near)
+    near, lean = log_uniform(rng, *_NEAR_MM), np.deg2rad(tilt)
+    back = np.array([np.sin(lean) * np.cos(turn), np.sin(lean) * np.sin(turn), np.cos(lean)])
+    spin = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
+    rotation = spin @ rotation_onto(-back, np.array([0.0, 0.0, 1.0]))
+    there = organ.vertices_mm @ rotation.T
+    pose = rigid(rotation, np.array([*-there[:, :2].mean(0), near - there[:, 2].min()]))
     pose[:2, 3] += rng.uniform(-0.08, 0.08, 2) * near
     about = {"tilt_degrees": tilt, "nearest_mm": near, "roll_degrees": float(np.rad2deg(roll))}
     return pose, about
 
 
-def direction(tilt_degrees: float, turn: float) -> np.ndarray:
-    """A unit vector at this angle from straight up."""
-    lean = np.deg2rad(tilt_degrees)
-    return np.array([np.sin(lean) * np.cos(turn), np.sin(lean) * np.sin(turn), np.cos(lean)])
-
-
-def facing(back: np.ndarray, roll: float) -> np.ndarray:
-    """The rotation of a camera (camera_from_bench) that looks from the direction ``back``, turned
-    by ``roll`` (radians) about its axis."""
-    spin = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
-    return spin @ rotation_onto(-back, np.array([0.0, 0.0, 1.0]))
-
-
-def pose_before(organ: Mesh, rotation: np.ndarray, nearest_mm: float) -> Transform:
-    """The pose of a camera with this rotation, with the organ in the middle of its image."""
-    there = organ.vertices_mm @ rotation.T
-    return rigid(rotation, np.array([*-there[:, :2].mean(0), nearest_mm - there[:, 2].min()]))
-
-
-def render(mesh: Mesh, to_camera: Transform, camera: Intrinsics) -> np.ndarray:
+def _render(mesh: Mesh, to_camera: Transform, camera: Intrinsics) -> np.ndarray:
     """True depths of a mesh (bench frame), NaN where it is not seen."""
     there = transform_points(to_camera, mesh.vertices_mm)
     return render_depth(there, mesh.faces, camera).depth_mm.astype(float)
@@ -131,14 +116,14 @@ def _organ_depth(
     state: Deformed, organ: Mesh, to_camera: Transform, camera: Intrinsics
 ) -> np.ndarray:
     """Of a slit organ: with the slit's walls instead of the triangles that span it."""
-    film = render(organ, to_camera, camera)
+    film = _render(organ, to_camera, camera)
     if state.wound is None:
         return film
     rest = state.organ.anatomy.organ.vertices_mm
     before, now = (_edges(points[organ.faces]) for points in (rest, organ.vertices_mm))
     skin = Mesh(organ.vertices_mm, organ.faces[(now < 1.8 * before + 1.0).all(1)])
     walls = Mesh(state.nodes_mm, state.wound.walls)
-    depth = np.fmin(render(skin, to_camera, camera), render(walls, to_camera, camera))
+    depth = np.fmin(_render(skin, to_camera, camera), _render(walls, to_camera, camera))
     depth = np.maximum(depth, film)  # the walls of a coarse mesh may stand out of the skin
     depth[~(depth < film + _DEEPER_MM)] = np.nan
     return depth
@@ -148,7 +133,7 @@ def _edges(corners: np.ndarray) -> np.ndarray:
     return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
 
 
-def ground_mesh(rim_mm: float, rng: Generator) -> Mesh:
+def _ground_mesh(rim_mm: float, rng: Generator) -> Mesh:
     """The uneven ground round the organ, as high as its bed's rim."""
     ticks = np.arange(-320.0, 321.0, 8.0)
     x, y = np.meshgrid(ticks, ticks, indexing="ij")
@@ -181,7 +166,7 @@ def _beside(organ: Mesh, rng: Generator) -> list[Mesh]:
     return things
 
 
-def covering(
+def _covering(
     organ: np.ndarray, own: np.ndarray, camera: Intrinsics, hidden: float, rng: Generator
 ) -> tuple[Callable[[float], Mesh], float, str]:
     """A hand or instruments that come in from a side (camera frame), as a function of how far; how
@@ -189,7 +174,7 @@ def covering(
     kind, angle = str(rng.choice(["hand", "instruments"])), rng.uniform(0, 2 * np.pi)
     back = np.array([np.cos(angle), np.sin(angle), 0.0])  # where they come from
     side = np.array([-back[1], back[0], 0.0])
-    shape = (hand_mesh if kind == "hand" else _instruments)(back, side, rng)
+    shape = (_hand_mesh if kind == "hand" else _instruments)(back, side, rng)
     row, column = np.nonzero(own)
     middle = float(organ[own].min()) - rng.uniform(5.0, 25.0)
     aim = np.array([column.mean() - camera.cx, row.mean() - camera.cy]) / camera.fx * middle
@@ -203,12 +188,12 @@ def covering(
     for _ in range(12):
         share = (low + high) / 2
         with np.errstate(invalid="ignore"):
-            covered = float((render(at(share), np.eye(4), camera)[own] < organ[own]).mean())
+            covered = float((_render(at(share), np.eye(4), camera)[own] < organ[own]).mean())
         low, high = (share, high) if covered < hidden else (low, share)
     return at, high, kind
 
 
-def hand_mesh(back: np.ndarray, side: np.ndarray, rng: Generator) -> Mesh:
+def _hand_mesh(back: np.ndarray, side: np.ndarray, rng: Generator) -> Mesh:
     """Four fingers, a palm and the arm behind them."""
     rods, rise = [], np.array([0.0, 0.0, -0.25])
     for n, length in enumerate((66.0, 76.0, 72.0, 55.0)):

@@ -1,1 +1,0 @@
-"""The studies behind docs/results.md and others: measurements, tables, pictures."""
