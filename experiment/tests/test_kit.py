@@ -15,9 +15,10 @@ from tumortrack.cli.main import run
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.mesh_files import read_mesh
+from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Anatomy
 from tumortrack.imaging.case import Case, save_case
-from tumortrack.imaging.meshes import label_meshes, mesh_of, solid_of
+from tumortrack.imaging.meshes import label_meshes
 from tumortrack_experiment.kit import recipe
 from tumortrack_experiment.kit.base import (
     BaseConfig,

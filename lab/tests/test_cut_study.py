@@ -13,8 +13,8 @@ from world import Planner, cut_one, exophytic, tables_of, truth
 from reports import bounded
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
-from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.models.report import estimate_of
 from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.world.cut import cut

@@ -12,8 +12,8 @@ from plan_objects import HALF_MM, MIDDLE_MM, RADIUS_MM, TUMOR_MM, located, spher
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.mesh_query import contains
 from tumortrack.core.report import Finding
+from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.live.values import PublishedFrame
 from tumortrack_lab.world.cut import cut as cut_out
 from tumortrack_resection.budget import planned_budgets

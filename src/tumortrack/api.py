@@ -215,8 +215,8 @@ def write_scenes(
 
 def export(case: StrPath, folder: StrPath, **options: Unpack[ExportKeywords]) -> tuple[str, ...]:
     """Write a case, or what was located, as a scene for 3D Slicer, and a CT's as DICOM; returns
-    what to know of the DICOM file. Raises InputError, ArtifactError: folders or options that do not fit
-    each other, or cannot be used.
+    what to know of the DICOM file. Raises InputError, ArtifactError: folders or options that do
+    not fit each other, or cannot be used.
 
     Args:
         case: folder that ``prepare`` wrote, or alone one that ``locate`` wrote.

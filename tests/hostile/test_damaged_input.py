@@ -29,7 +29,8 @@ from stereo_objects import endoscope
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import TumortrackError
-from tumortrack.core.evidence import Free, Outline, Touch, evidence_json
+from tumortrack.core.evidence import Free, Outline, Touch
+from tumortrack.core.evidence_files import evidence_json
 from tumortrack.core.types import Volume
 
 EXAMPLES, EXAMPLES_A_TIME = 40, 500  # of each reader; and with --attack TIMES

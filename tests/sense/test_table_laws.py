@@ -15,7 +15,7 @@ from PIL import Image
 
 from depth_files import write_intrinsics
 from tumortrack.core.errors import InputError
-from tumortrack.core.evidence import read_evidence
+from tumortrack.core.evidence_files import read_evidence
 from tumortrack.core.store import natural, read_json
 from tumortrack.core.types import Intrinsics
 from tumortrack.live.calibration_file import read_frames

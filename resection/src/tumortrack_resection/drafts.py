@@ -13,8 +13,8 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.mesh_query import contains
 from tumortrack.core.organ import organ_name
+from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import ORGAN, Mesh
-from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack_resection.facets import (
     TOOLS,
     UP,

@@ -16,8 +16,8 @@ from tumortrack.core.colours import CUT, ENERGISED, NOW, ORGAN_PART, TO_CUT, nam
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.organ import is_tumor
+from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.store import write_atomically
-from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.live.values import RigidShape
 from tumortrack.report import drawing
 from tumortrack_resection.facets import TOOLS

@@ -9,8 +9,8 @@ import trimesh
 from numpy.typing import ArrayLike
 
 from tumortrack.core.mesh_query import contains
+from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Mesh
-from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack_resection.values import Located
 
 HALF_MM = np.array([55.0, 30.0, 25.0])  # of the organ's axes

@@ -6,7 +6,6 @@ import itertools
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from tumortrack.core.geometry import RAS_FROM_LPS, transform_points
 from tumortrack.core.mesh_files import SUFFIXES, read_mesh
 from tumortrack.core.organ import KIDNEY, Organ
 from tumortrack.core.report import Finding, Note
+from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.store import natural
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, Anatomy, LabelVolume, Mesh, part_names
 from tumortrack.imaging.grid import grid_round
@@ -265,22 +265,3 @@ def is_simple(mesh: Mesh, step_mm: float) -> bool:
         if wrong.sum() > 2:
             return False
     return True
-
-
-def solid_of(mesh: Mesh, name: str) -> Any:
-    """A closed mesh as a ``manifold3d.Manifold``. Raises InputError, which names ``name``: it is
-    open, crosses itself too much, or is inside out."""
-    import manifold3d
-
-    raw = manifold3d.Mesh64(mesh.vertices_mm.copy(), mesh.faces.astype(np.uint64))
-    solid = manifold3d.Manifold(raw)
-    if (status := solid.status()) != manifold3d.Error.NoError or solid.volume() <= 0:
-        what = f"is no closed surface with faces outward ({status.name})"
-        raise InputError(f"{name} {what}. Repair it.")
-    return solid
-
-
-def mesh_of(solid: Any) -> Mesh:
-    """A ``manifold3d.Manifold``'s surface, faces outward."""
-    out = solid.to_mesh64()
-    return Mesh(out.vert_properties[:, :3], out.tri_verts)

@@ -17,7 +17,6 @@ _MOST_TILTED = 60.0  # degrees: two such tilts make 85, and more would show anot
 _ALLOWED = {
     "rotations": ("limited", "full"), "sensor": ("d405", "stereo"), "unit": ("mm", "m", None),
 }  # fmt: skip
-StructureSources = dict[str, int | Path]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,10 +122,10 @@ def _labels(given: int | tuple[int, ...]) -> tuple[int, ...]:
     return numbers
 
 
-def parse_structures(options: tuple[str, ...], organ: str) -> StructureSources:
+def parse_structures(options: tuple[str, ...], organ: str) -> dict[str, int | Path]:
     """The label number or the mesh's path by name. Raises InputError: not NAME=NUMBER or NAME=PATH,
     a name twice, or one that is not allowed."""
-    stated: StructureSources = {}
+    stated: dict[str, int | Path] = {}
     for option in options:
         name, _, value = option.partition("=")
         if not value:

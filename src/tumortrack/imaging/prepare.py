@@ -25,9 +25,9 @@ from tumortrack.imaging.grid import check_suffix, face_areas_mm2, grown_box, lab
 from tumortrack.imaging.hu_windows import segment_ct
 from tumortrack.imaging.meshes import LEAST_DROPPED_ML, label_meshes, read_meshes
 from tumortrack.imaging.options import PrepareOptions, parse_structures
-from tumortrack.imaging.segments import Parts, is_tumor, other_organ, parts_of
+from tumortrack.imaging.segments import Parts, is_tumor, other_organ
 from tumortrack.imaging.select import among, neighbours, select_labels
-from tumortrack.imaging.structures import extent_report, read_structures, split_structures
+from tumortrack.imaging.structures import extent_report, parts_of, read_structures, split_structures
 from tumortrack.imaging.surface import surfaces
 from tumortrack.imaging.symmetry import ambiguous, half_turns, warning
 from tumortrack.imaging.volume import (

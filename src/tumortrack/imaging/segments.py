@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -12,9 +13,7 @@ from jaxtyping import UInt8
 from tumortrack.core.errors import InputError
 from tumortrack.core.organ import KNOWN
 from tumortrack.core.patient import UNKNOWN, Side
-from tumortrack.core.types import ORGAN
-from tumortrack.imaging.grid import RawVolume, Segment
-from tumortrack.imaging.options import PrepareOptions, StructureSources, parse_structures
+from tumortrack.imaging.grid import Segment
 
 _TUMOR = re.compile(
     r"(tumou?r|lesion|cancer|mass|nodule|rcc|aml|gtv|\w*(carcinoma|adenoma|oncocytoma|angiomyolipoma|"
@@ -61,6 +60,9 @@ def check_side(names: Iterable[str], side: Side) -> None:
             raise InputError(f"--side says {side}, and {name!r} another one. Correct one of them.")
 
 
+StructureSources = dict[str, int | Path]  # a label, or a mesh, by name
+
+
 class Parts(NamedTuple):
     """What is what in a label map: numbers of the organ (several count as its first), of tumors
     (None: all from 2 up) and of structures, which may be meshes too; ``names`` of all labels, none
@@ -72,33 +74,6 @@ class Parts(NamedTuple):
     names: dict[int, str]
     stated: bool  # the tumors, by options
     note: str = ""
-
-
-def parts_of(raw: RawVolume, options: PrepareOptions, where: str) -> Parts:
-    """As stated, or else by names; without either 1 is the organ and every other label a tumor.
-    Raises InputError: labels have names, and none is the organ's."""
-    names = {segment.number: segment.name for segment in raw.segments}
-    sources = parse_structures(options.structure, options.name)
-    numbers = {name: number for number, name in names.items()}
-    structures = {name: numbers.get(str(source), source) for name, source in sources.items()}
-    organ = options.organs or tuple(n for n in names if is_organ(names[n], options.name))
-    tumors = options.tumors
-    if not names:
-        stated = tumors if tumors is not None or options.organs in ((), (ORGAN,)) else ()
-        note = "tumors by their numbers alone: every label from 2 up" if stated is None else ""
-        return Parts(organ or (ORGAN,), stated, structures, {}, tumors is not None, note)
-    listing = ", ".join(f"{n} {name}" for n, name in names.items())
-    if not organ:
-        raise InputError(
-            f"{where} holds {listing}: none is a {options.kind.words} by name. Give --organ "
-            "NUMBER, or --name of another organ."
-        )
-    check_side((names[n] for n in organ if n in names), options.stated_side)
-    if tumors is None:
-        tumors = tuple(n for n in names if is_tumor(names[n]) and n not in organ)
-    taken = [" and ".join(names.get(n, f"{n}") for n in of) or "none" for of in (organ, tumors)]
-    note = f"organ: {taken[0]}; tumors: {taken[1]}; of {listing}"
-    return Parts(organ, tumors, structures, names, options.tumors is not None, note)
 
 
 def painted(

@@ -17,10 +17,11 @@ from scipy.spatial import cKDTree
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm, transform_points
 from tumortrack.core.report import Note
-from tumortrack.core.types import Anatomy, LabelVolume, Mesh
-from tumortrack.imaging.grid import bounding_box
+from tumortrack.core.types import ORGAN, Anatomy, LabelVolume, Mesh
+from tumortrack.imaging.grid import RawVolume, bounding_box
 from tumortrack.imaging.meshes import read_lps
-from tumortrack.imaging.options import StructureSources
+from tumortrack.imaging.options import PrepareOptions, parse_structures
+from tumortrack.imaging.segments import Parts, StructureSources, check_side, is_organ, is_tumor
 from tumortrack.imaging.surface import surface_of
 
 TRUSTED_MM = 5.0  # outside the organ; farther out the motion is a guess
@@ -103,3 +104,30 @@ def extent_report(
                 f"than {TRUSTED_MM:g} mm ({share:.0%} of it) its motion is a guess"
             )
     return report, notes
+
+
+def parts_of(raw: RawVolume, options: PrepareOptions, where: str) -> Parts:
+    """As stated, or else by names; without either 1 is the organ and every other label a tumor.
+    Raises InputError: labels have names, and none is the organ's."""
+    names = {segment.number: segment.name for segment in raw.segments}
+    sources = parse_structures(options.structure, options.name)
+    numbers = {name: number for number, name in names.items()}
+    structures = {name: numbers.get(str(source), source) for name, source in sources.items()}
+    organ = options.organs or tuple(n for n in names if is_organ(names[n], options.name))
+    tumors = options.tumors
+    if not names:
+        stated = tumors if tumors is not None or options.organs in ((), (ORGAN,)) else ()
+        note = "tumors by their numbers alone: every label from 2 up" if stated is None else ""
+        return Parts(organ or (ORGAN,), stated, structures, {}, tumors is not None, note)
+    listing = ", ".join(f"{n} {name}" for n, name in names.items())
+    if not organ:
+        raise InputError(
+            f"{where} holds {listing}: none is a {options.kind.words} by name. Give --organ "
+            "NUMBER, or --name of another organ."
+        )
+    check_side((names[n] for n in organ if n in names), options.stated_side)
+    if tumors is None:
+        tumors = tuple(n for n in names if is_tumor(names[n]) and n not in organ)
+    taken = [" and ".join(names.get(n, f"{n}") for n in of) or "none" for of in (organ, tumors)]
+    note = f"organ: {taken[0]}; tumors: {taken[1]}; of {listing}"
+    return Parts(organ, tumors, structures, names, options.tumors is not None, note)

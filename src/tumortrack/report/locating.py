@@ -12,7 +12,8 @@ from tumortrack.assessment.bound import depths_within_mm
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.evidence import CAMERA, Evidence, read_evidence
+from tumortrack.core.evidence import CAMERA, Evidence
+from tumortrack.core.evidence_files import read_evidence
 from tumortrack.report.seen import Seen
 from tumortrack.tracking.options import LocateOptions, check_grid, model_folder
 from tumortrack.tracking.points import PointTable, check_near_organ, read_points

@@ -19,9 +19,9 @@ VERDICTS = ("good", "poor", "none")
 RULE = (
     "Medians over all scenes that have the part. A part that was not found counts as infinitely "
     "far and with IoU 0; a median that is infinite is written as null. A scene counts as failed "
-    "where a part was not found, or where the centre of a tumor (without one: of the organ) is over "
-    f"{FAR_MM:g} mm off, whether the answer is called good or poor; where nothing was found its "
-    "mIoU is 0 and its target errors are infinite."
+    "where a part was not found, or where the centre of a tumor (without one: of the organ) is "
+    f"over {FAR_MM:g} mm off, whether the answer is called good or poor; where nothing was found "
+    "its mIoU is 0 and its target errors are infinite."
 )
 NO_RIVALS = (
     "Rigid registration is left out: it needs the organ at rest, which models of the preset clinic "

@@ -15,7 +15,7 @@ from safetensors.numpy import save
 
 from tumortrack.core.config import from_builtins
 from tumortrack.core.errors import InputError
-from tumortrack.core.evidence import EvidenceFile, evidence_json
+from tumortrack.core.evidence_files import EvidenceFile, evidence_json
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, DepthError, DepthFrame, Intrinsics, Mesh, SensorCloud
 from tumortrack.sense.files import DEPTH_UNIT_MM

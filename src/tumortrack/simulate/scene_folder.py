@@ -17,12 +17,13 @@ from tumortrack.core import store
 from tumortrack.core.config import check_seed
 from tumortrack.core.csv_tables import read_rows
 from tumortrack.core.errors import InputError
-from tumortrack.core.evidence import Evidence, evidence_json, read_evidence
+from tumortrack.core.evidence import Evidence
+from tumortrack.core.evidence_files import evidence_json, read_evidence
 from tumortrack.core.mesh_files import read_anatomy, write_anatomy
 from tumortrack.core.mesh_query import contains, labels_of
 from tumortrack.core.organ import KIDNEY, Organ, is_tumor, organ_entry, organ_in
+from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud
-from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack.sense.files import depth_png, intrinsics_json, read_cloud, read_depth_png
 from tumortrack.sense.ply import write_cloud_ply
 

@@ -15,8 +15,8 @@ from scipy.spatial import ConvexHull
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import perpendicular, rigid, transform_points, unit
+from tumortrack.core.solids import solid_of
 from tumortrack.core.types import Mesh
-from tumortrack.imaging.meshes import solid_of
 from tumortrack_experiment.kit.parting import Cells, HeightField, best_pull, parting_surface
 
 FLANGE_MM, THICK_MM = 14.0, 8.0  # beyond the wall, room for a washer; each half's, at the rim

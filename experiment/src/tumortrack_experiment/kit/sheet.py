@@ -14,9 +14,9 @@ import numpy as np
 from PIL import Image
 
 from tumortrack.core.geometry import rigid, rotation_onto, transform_points, unit
+from tumortrack.core.solids import mesh_of
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import Mesh
-from tumortrack.imaging.meshes import mesh_of
 from tumortrack.report.renderer import Body, Viewpoint, render
 from tumortrack_experiment.kit import recipe
 from tumortrack_experiment.kit.casting import THICK_MM, rod

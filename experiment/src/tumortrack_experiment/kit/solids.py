@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from tumortrack.core.solids import solid_of
 from tumortrack.core.types import Mesh
-from tumortrack.imaging.meshes import solid_of
 
 _SIDES = 48  # of a circle: a cone is then out of round by 0.006 mm where a bead touches it
 Corner = Sequence[float] | np.ndarray

@@ -10,8 +10,8 @@ from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Mesh
-from tumortrack.imaging.meshes import mesh_of, solid_of
 from tumortrack_experiment.kit.values import PrintedPart
 
 _PEG_MM, _LONG_MM, _WALL_MM = (3.0, 2.2), 5.0, 2.0  # a cone's radii, its height, round its hole

@@ -17,8 +17,8 @@ from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points, triangles_of
+from tumortrack.core.solids import mesh_of
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.imaging.meshes import mesh_of
 from tumortrack_experiment.kit.recipe import COUPON_MM, COUPONS
 from tumortrack_experiment.kit.solids import ball, box, cone, written
 from tumortrack_experiment.kit.values import PrintedPart
