@@ -18,23 +18,23 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from tumortrack.case.surface import surfaces
 from tumortrack.cli.main import run
 from tumortrack.core import store
+from tumortrack.core.cloud import CloudConfig
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.evidence import Held, Landmark, Outline, Touch
 from tumortrack.core.geometry import plane_section
 from tumortrack.core.report import FitReport
 from tumortrack.core.types import SensorCloud
-from tumortrack.imaging.case import Case, save_case
-from tumortrack.imaging.surface import surfaces
-from tumortrack.phantom.digital import PhantomParameters, phantom_labels
-from tumortrack.sense.cloud import CloudConfig
-from tumortrack.sense.region import Hints, RegionConfig, organ_points
-from tumortrack.simulate.dataset import scene_maker
-from tumortrack.simulate.deform.elastic import ElasticConfig
-from tumortrack.simulate.scene import SceneConfig
-from tumortrack.simulate.scene_folder import Scene
+from tumortrack.io.case import Case, save_case
+from tumortrack.io.scene_folder import Scene
+from tumortrack.segmentation import Hints, RegionConfig, organ_points
+from tumortrack.simulation.dataset import scene_maker
+from tumortrack.simulation.deform.elastic import ElasticConfig
+from tumortrack.simulation.phantom.digital import PhantomParameters, phantom_labels
+from tumortrack.simulation.scene import SceneConfig
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 
 Numbers = dict[str, Any]
@@ -206,7 +206,7 @@ def answers(clouds: int, images: int, pieces: int, runs: int) -> Iterator[Answer
 
 def plan() -> Numbers:
     """Volumes and clearances of a plan with the arms."""
-    from tumortrack.simulate.scene_folder import write_scene_files
+    from tumortrack.io.scene_folder import write_scene_files
 
     camera(0)
     cloud = Path("scene/cloud.ply")

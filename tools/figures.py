@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pandas as pd
 
+from tumortrack.assessment.fingerprint import fingerprint
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
-from tumortrack.sense.sensors import FIGURES, simulated
-from tumortrack.tracking.fingerprint import fingerprint
+from tumortrack.simulation.sensors import FIGURES, simulated
 from tumortrack_lab.document import MeasuredTable, rendered
 
 

@@ -39,7 +39,7 @@ from tumortrack.cli.console import progress_bar
 
 ROOT = Path(__file__).parents[1]
 LATEST = ROOT / "runs/replay.json"
-KEPT = ROOT / "src/tumortrack/tracking/answers.json"
+KEPT = ROOT / "src/tumortrack/assessment/answers.json"
 SAME_MM = 0.05  # far above what processors differ by, far below what anybody measures
 SAME_SHARE = 0.02  # of a figure of an answer's fit
 SAME_INPUT_MM = 0.01

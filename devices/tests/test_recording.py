@@ -31,11 +31,13 @@ from live_objects import (
 )
 from recording_objects import PERIOD_NS, frame_number, play, record, update_number, write_bag
 from tumortrack.core import store
+from tumortrack.core.camera import d405
 from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.evidence import Free, Held, Landmark, Outline, Touch
 from tumortrack.core.geometry import HERE, rigid
-from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.io.mesh_files import write_anatomy
+from tumortrack.io.ply import write_cloud_ply
 from tumortrack.live.cameras import camera_setup
 from tumortrack.live.poses import FilePoses
 from tumortrack.live.values import (
@@ -45,8 +47,6 @@ from tumortrack.live.values import (
     SourceEnded,
 )
 from tumortrack.report.inspection import describe
-from tumortrack.sense.camera import d405
-from tumortrack.sense.ply import write_cloud_ply
 from tumortrack_devices.recording.mcap import McapBag, camera_messages
 from tumortrack_devices.ros.messages import Messages
 from tumortrack_devices.sinks.recording import RecordingSinkConfig

@@ -19,10 +19,10 @@ from tumortrack import api
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import DepthFrame
-from tumortrack.imaging.case import load_case
+from tumortrack.io.case import load_case
 from tumortrack.live.spec import SOURCES
 from tumortrack.live.values import Source, SourceEnded, SourceLost
-from tumortrack.sense.noise import (
+from tumortrack.simulation.noise import (
     CLEAN,
     D405_NOISE,
     STEREO_NOISE,

@@ -13,6 +13,8 @@ from clock import PATIENCE_S, until
 from colour_objects import COLOURS, Light, clicks_on, painted
 from elastic_objects import UP
 from region_objects import FAT, Props, make_scene
+from tumortrack.core.camera import deproject_pixels
+from tumortrack.core.cloud import CloudConfig
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import DepthFrame
@@ -25,9 +27,7 @@ from tumortrack.live.values import (
     SourceEnded,
 )
 from tumortrack.live.workers import SinkWorker, SourceWorker
-from tumortrack.sense.camera import deproject_pixels
-from tumortrack.sense.cloud import CloudConfig
-from tumortrack.sense.region import RegionConfig
+from tumortrack.segmentation import RegionConfig
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_devices.sinks.viewer import ViewerSinkConfig

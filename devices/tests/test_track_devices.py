@@ -12,10 +12,10 @@ from rosbags.highlevel import AnyReader
 
 from stories import refusal, succeeded, tumortrack
 from track_objects import PATIENT, World, ended_when, start, told, virtual, wait_for
+from tumortrack.core.camera import d405, project
 from tumortrack.core.errors import InputError
 from tumortrack.live.poses import COLUMNS, CONTACT
 from tumortrack.live.values import SourceEnded
-from tumortrack.sense.camera import d405, project
 from tumortrack_devices.sources.recording import RecordingSourceConfig
 
 pytestmark = pytest.mark.slow

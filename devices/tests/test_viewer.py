@@ -21,9 +21,9 @@ from tumortrack.core.patient import Patient
 from tumortrack.core.report import EvidenceReport
 from tumortrack.core.store import new_folder
 from tumortrack.core.types import Anatomy, LabelVolume, Mesh, Volume
-from tumortrack.imaging.case import Case, save_case
+from tumortrack.io.case import Case, save_case
 from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
-from tumortrack.tracking.slices import CarriedCt, SlicePlane
+from tumortrack.report.slices import CarriedCt, SlicePlane
 from tumortrack_devices.display import seen_points
 from tumortrack_devices.sinks.viewer import ViewerSink, ViewerSinkConfig, slice_picture
 from tumortrack_devices.viewer.look import point_under

@@ -16,11 +16,11 @@ from theatre_objects import COARSE, small_theatre
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import LabelVolume, Mesh
-from tumortrack.imaging.case import Case, save_case
+from tumortrack.io.case import Case, save_case
 from tumortrack.live.spec import SOURCES
-from tumortrack.sense.noise import CLEAN
-from tumortrack.sense.sensors import simulated
-from tumortrack.simulate.elastic.body import BodyConfig
+from tumortrack.organ.body import BodyConfig
+from tumortrack.simulation.noise import CLEAN
+from tumortrack.simulation.sensors import simulated
 from tumortrack_devices.player import SHAFT_MM, ScenePlayer, ScenePlayerConfig, rod
 from tumortrack_devices.pulled import PulledStates
 from tumortrack_devices.sources.virtual import VirtualSource, VirtualSourceConfig

@@ -11,15 +11,15 @@ from scipy.spatial.transform import Rotation
 
 from live_objects import small_frame
 from stories import refusal, succeeded, tumortrack
+from tumortrack.core.camera import deproject
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import DepthFrame
+from tumortrack.io.depth_files import depth_png, intrinsics_json, read_depth_png
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.poses import COLUMNS, pose_row
 from tumortrack.live.values import Observation
-from tumortrack.sense.camera import deproject
-from tumortrack.sense.files import depth_png, intrinsics_json, read_depth_png
 from tumortrack_devices.recording.mcap import STRING, McapBag, camera_messages
 from tumortrack_devices.ros.messages import Messages, Outgoing
 from tumortrack_experiment.calibrate.board import Board, Corners, draw_board, find_boards

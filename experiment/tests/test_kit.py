@@ -11,14 +11,14 @@ import trimesh
 from manifold3d import Manifold
 from scipy.spatial.transform import Rotation
 
+from tumortrack.case.meshes import label_meshes
 from tumortrack.cli.main import run
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
-from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Anatomy
-from tumortrack.imaging.case import Case, save_case
-from tumortrack.imaging.meshes import label_meshes
+from tumortrack.io.case import Case, save_case
+from tumortrack.io.mesh_files import read_mesh
 from tumortrack_experiment.kit import recipe
 from tumortrack_experiment.kit.base import (
     BaseConfig,

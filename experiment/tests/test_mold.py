@@ -7,10 +7,10 @@ from manifold3d import Manifold
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points, triangles_of
 from tumortrack.core.mesh_query import contains
+from tumortrack.core.render import Visibility
 from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Anatomy
 from tumortrack.report.metrics import distance_to_surface
-from tumortrack.sense.render import Visibility
 from tumortrack_experiment.kit.casting import cut_halves, lay_out, rod
 from tumortrack_experiment.kit.mold import MoldConfig, organ_mold, tumor_molds
 from tumortrack_experiment.kit.mold_checks import demould

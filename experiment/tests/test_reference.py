@@ -14,8 +14,8 @@ import bench_objects as bench
 from tumortrack.cli.main import run
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.io.scene_folder import read_scene
 from tumortrack.live.calibration_file import read_frames
-from tumortrack.simulate.scene_folder import read_scene
 from tumortrack_experiment.kit_file import KIT_FILE, read_kit
 from tumortrack_experiment.record.read import Moment, Recorded
 from tumortrack_experiment.reference import scenes

@@ -27,6 +27,7 @@ from scipy.stats import spearmanr
 
 from tumortrack.assessment.advice import advise
 from tumortrack.assessment.bound import CONFIDENCE, POOR_MM, BoundModel, Quantile, figures
+from tumortrack.assessment.fingerprint import fingerprint
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import NoEstimate
@@ -34,10 +35,9 @@ from tumortrack.core.estimate import FAR_MM, Estimate
 from tumortrack.core.organ import is_tumor
 from tumortrack.core.report import FAR_OFF
 from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.io.scene_folder import Scene, read_scene
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.report import drawing
-from tumortrack.simulate.scene_folder import Scene, read_scene
-from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab import scripting
 from tumortrack_lab.document import share_words, table_of

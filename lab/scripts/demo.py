@@ -3,7 +3,7 @@ phantom in states of the twin and of the wider world, seen as that sees, touched
 
     make demo-scenes ARGS='OUT'        (some five minutes)
 
-Writes src/tumortrack/simulate/phantom_scenes.safetensors. OUT keeps the phantom's CT and case and
+Writes src/tumortrack/simulation/phantom_scenes.safetensors. OUT keeps the phantom's CT and case and
 the tetrahedra, with which the same command gives the same file.
 
 Nothing in the scenes is chosen by what any method makes of them. Of a family it is the first state,
@@ -26,12 +26,12 @@ import tyro
 import tumortrack as tt
 from tumortrack.cli.console import say
 from tumortrack.core import store
+from tumortrack.core.camera import with_depth_error
 from tumortrack.core.errors import NoEstimate, TumortrackError
 from tumortrack.core.geometry import transform_points, triangles_of
-from tumortrack.imaging.case import Case
-from tumortrack.sense.camera import with_depth_error
-from tumortrack.simulate import datasets
-from tumortrack.simulate.scene_folder import InnerPoints, Scene, draw_targets
+from tumortrack.io.case import Case
+from tumortrack.io.scene_folder import InnerPoints, Scene, draw_targets
+from tumortrack.simulation import datasets
 from tumortrack_lab import scripting
 from tumortrack_lab.world.equilibrium import Rod
 from tumortrack_lab.world.evidence import EvidenceSource

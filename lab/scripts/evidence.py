@@ -26,8 +26,8 @@ from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import perpendicular, triangles_of
 from tumortrack.core.report import NextEvidence
 from tumortrack.core.types import Anatomy
+from tumortrack.io.scene_folder import Scene, read_scene
 from tumortrack.registration.model import RegistrationModel
-from tumortrack.simulate.scene_folder import Scene, read_scene
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab import scripting
 from tumortrack_lab.document import table_of
@@ -82,12 +82,13 @@ def main(options: Options) -> None:
     rows = scripting.together(_measured, made)
     frame = pd.DataFrame(rows)
     own = frame[frame.organ == "own"]
-    families = [errors(some).assign(family=name) for name, some in own.groupby("family")]
+    families = {("random kidneys", name): errors(some) for name, some in own.groupby("family")}
+    each = pd.concat(families, names=["organs", "family"]).reset_index(["organs", "family"])
     tables = {
         "evidence-kidneys-errors": errors(frame),
         "evidence-kidneys-advice": foresight(frame),
         "evidence-kidneys-verdicts": verdicts(frame),
-        "evidence-families": pd.concat(families).assign(organs="random kidneys"),
+        "evidence-families": each,
     }
     for name, table in tables.items():
         print(name, table_of(table), sep="\n\n", end="\n\n")

@@ -25,20 +25,20 @@ import tyro
 from jaxtyping import Float
 from matplotlib.lines import Line2D
 
-import tumortrack.sense
+import tumortrack.simulation
 from tumortrack.cli.console import say
 from tumortrack.core import store
+from tumortrack.core.camera import d405, deproject, with_depth_error
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.render import render_depth
 from tumortrack.core.types import Anatomy, DepthError, DepthFrame, SensorCloud
+from tumortrack.io.scene_folder import Scene, list_scenes, read_scene
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.report import drawing
 from tumortrack.report.rivals import best_rigid_pose, rigid_fit
-from tumortrack.sense.camera import d405, deproject, with_depth_error
-from tumortrack.sense.region import Hints, organ_points
-from tumortrack.sense.render import render_depth
-from tumortrack.sense.sensors import FIGURES, SensorConfig, depth_error_of, simulated
-from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
+from tumortrack.segmentation import Hints, organ_points
+from tumortrack.simulation.sensors import FIGURES, SensorConfig, depth_error_of, simulated
 from tumortrack.tracking.tracker import Tracker, region_for
 from tumortrack_lab import scripting
 from tumortrack_lab.document import share_words, table_of
@@ -100,7 +100,7 @@ def main(options: Options) -> None:
 
 def _rows(options: Options) -> Iterator[dict[str, Any]]:
     """Of all cases and conditions."""
-    sensors = Path(tumortrack.sense.__path__[0]) / "sensors.toml"
+    sensors = Path(tumortrack.simulation.__path__[0]) / "sensors.toml"
     code = scripting.code_sha256([Path(__file__), sensors])
     for pair in options.cases:
         case, equals, folder = pair.partition("=")

@@ -35,9 +35,9 @@ from tumortrack.core.errors import TumortrackError
 from tumortrack.core.geometry import Affine, transform_points
 from tumortrack.core.organ import is_tumor
 from tumortrack.core.types import Anatomy
-from tumortrack.imaging.case import load_case
+from tumortrack.io.case import load_case
+from tumortrack.io.scene_folder import read_scene, write_scene_files
 from tumortrack.report.metrics import surface_distances
-from tumortrack.simulate.scene_folder import read_scene, write_scene_files
 from tumortrack_experiment.calibrate.board import Board
 from tumortrack_experiment.kit_file import Kit, read_kit
 from tumortrack_lab import scripting

@@ -19,17 +19,17 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
 from tumortrack.core import store
+from tumortrack.core.camera import d405
 from tumortrack.core.config import Config
 from tumortrack.core.geometry import Affine, rigid, transform_points
-from tumortrack.core.mesh_files import read_mesh
+from tumortrack.core.raster import label_grid, voxelise
+from tumortrack.core.render import render_depth
 from tumortrack.core.types import Anatomy, DepthFrame, Intrinsics, LabelVolume, Mesh, Volume
-from tumortrack.imaging.raster import label_grid, voxelise
-from tumortrack.phantom.dicom import write_dicom_series
-from tumortrack.phantom.scanner import ScannerParameters, scan
-from tumortrack.sense.camera import d405
-from tumortrack.sense.files import depth_png, intrinsics_json
-from tumortrack.sense.noise import D405_NOISE, add_noise
-from tumortrack.sense.render import render_depth
+from tumortrack.io.depth_files import depth_png, intrinsics_json
+from tumortrack.io.mesh_files import read_mesh
+from tumortrack.simulation.noise import D405_NOISE, add_noise
+from tumortrack.simulation.phantom.dicom import write_dicom_series
+from tumortrack.simulation.phantom.scanner import ScannerParameters, scan
 from tumortrack_experiment.calibrate.board import Board
 from tumortrack_experiment.calibrate.lens import lens_of
 from tumortrack_experiment.calibrate.virtual_board import (

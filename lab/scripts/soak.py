@@ -304,7 +304,8 @@ def document(judge: Judge, report: dict[str, Any], about: str) -> str:
         rows[name] = ", ".join(f"{key} {found.get(key)}" for key in ("p50", "p99", "p99.9", "max"))
     rows["memory, MB, after a minute and at the end"] = "{:.0f}, {:.0f}".format(*grown_mb(judge))
     for name, sink in report["sinks"].items():
-        rows[f"sink {name}"] = ", ".join(f"{value} {key}" for key, value in sink.items())
+        counts = (f"{sink[key]:,} {key}" for key in ("delivered", "dropped", "errors"))
+        rows[f"sink {name}"] = ", ".join(counts)
     faults = []
     for kind in FAULTS:
         answers = [one for one in judge.answers.values() if one.fault.kind == kind]

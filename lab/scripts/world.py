@@ -31,6 +31,7 @@ from tumortrack_resection.resection import plan_resection
 import tumortrack as tt
 import tumortrack_lab.world.cut
 import tumortrack_resection
+from tumortrack.assessment.bound_factor import NAME
 from tumortrack.cli.console import model_folder, progress_bar, say
 from tumortrack.core import store
 from tumortrack.core.config import Config, to_builtins
@@ -39,11 +40,10 @@ from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.mesh_query import surface_samples
 from tumortrack.core.types import Anatomy, OccupancyCloud
-from tumortrack.models.report import estimate_of
+from tumortrack.io.scene_folder import Scene, read_scene
+from tumortrack.registration.frame import estimate_of
 from tumortrack.registration.locator import QUERIES
 from tumortrack.report.metrics import distance_to_surface
-from tumortrack.simulate.scene_folder import Scene, read_scene
-from tumortrack.tracking.bound_factor import NAME
 from tumortrack_lab import scripting
 from tumortrack_lab.document import table_of
 from tumortrack_lab.scripting import cell

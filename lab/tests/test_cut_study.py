@@ -15,8 +15,8 @@ from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
-from tumortrack.models.report import estimate_of
-from tumortrack.simulate.scene_folder import Scene
+from tumortrack.io.scene_folder import Scene
+from tumortrack.registration.frame import estimate_of
 from tumortrack_lab.world.cut import cut
 from tumortrack_resection.drafts import plan_resection
 from tumortrack_resection.located import of_estimate

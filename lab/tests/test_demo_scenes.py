@@ -8,8 +8,8 @@ import pytest
 
 from tumortrack.core.errors import NoEstimate, TumortrackError
 from tumortrack.core.geometry import transform_points
-from tumortrack.imaging.case import load_case
-from tumortrack.simulate import datasets
+from tumortrack.io.case import load_case
+from tumortrack.simulation import datasets
 from tumortrack_lab.world import twin
 from tumortrack_lab.world.families import Deformed
 

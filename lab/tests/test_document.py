@@ -12,8 +12,8 @@ import pandas as pd
 import population
 import pytest
 
+from tumortrack.assessment.fingerprint import fingerprint
 from tumortrack.core.errors import InputError
-from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack_lab import scripting
 from tumortrack_lab.document import (
     MeasuredTable,

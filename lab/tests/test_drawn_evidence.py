@@ -14,8 +14,8 @@ import world_objects
 from tumortrack.core.errors import ArtifactError
 from tumortrack.core.geometry import triangles_of
 from tumortrack.core.mesh_query import contains
+from tumortrack.io.scene_folder import Scene
 from tumortrack.report.metrics import distance_to_surface
-from tumortrack.simulate.scene_folder import Scene
 from tumortrack_lab.world.evidence import (
     ALL_TRUE,
     ERRORS,

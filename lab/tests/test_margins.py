@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from stories import answered, refusal, succeeded, tumortrack
+from tumortrack.assessment.bound_factor import NAME, read_factor
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
-from tumortrack.simulate.scene_folder import list_scenes, read_scene
-from tumortrack.tracking.bound_factor import NAME, read_factor
+from tumortrack.io.scene_folder import list_scenes, read_scene
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab import margins

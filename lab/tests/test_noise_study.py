@@ -9,11 +9,11 @@ import pytest
 from noise import Condition, disturbed, placed
 
 from stories import looking_down
+from tumortrack.core.camera import d405, deproject
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.imaging.case import load_case
-from tumortrack.sense.camera import d405, deproject
-from tumortrack.simulate.scene_folder import Scene
+from tumortrack.io.case import load_case
+from tumortrack.io.scene_folder import Scene
 from tumortrack_lab.world.organ import moved
 from world_objects import ANATOMY
 

@@ -21,7 +21,7 @@ from rehearsal_bench import (
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.phantom.scanner import ScannerParameters
+from tumortrack.simulation.phantom.scanner import ScannerParameters
 from tumortrack_experiment.kit_file import Bead, Kit, KitPart
 from tumortrack_lab.rehearsal.camera import BenchSourceConfig
 

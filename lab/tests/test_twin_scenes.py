@@ -15,16 +15,16 @@ import trimesh
 import render_objects
 from stories import succeeded, tumortrack
 from tumortrack.core import store
+from tumortrack.core.camera import deproject
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
-from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.mesh_query import contains, labels_of
 from tumortrack.core.types import LabelVolume
-from tumortrack.imaging.case import Case, load_case, save_case
+from tumortrack.io.case import Case, load_case, save_case
+from tumortrack.io.mesh_files import read_mesh
+from tumortrack.io.scene_folder import list_scenes, read_scene
 from tumortrack.report.inspection import describe
 from tumortrack.report.metrics import label_grid
-from tumortrack.sense.camera import deproject
-from tumortrack.simulate.scene_folder import list_scenes, read_scene
 from tumortrack_lab.world import twin
 from tumortrack_lab.world.equilibrium import Rod
 from tumortrack_lab.world.families import Deformed

@@ -13,11 +13,11 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from tumortrack.core import store
+from tumortrack.core.camera import d405
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.rigid_fit import kabsch
 from tumortrack.core.solids import solid_of
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.sense.camera import d405
 from tumortrack_lab.world import segmentation
 from tumortrack_lab.world.equilibrium import Rod, find_equilibrium
 from tumortrack_lab.world.families import FAMILIES, Deformed, solve

@@ -10,7 +10,7 @@ import trimesh
 from dense_objects import dense_margins
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import OccupancyCloud
-from tumortrack.models.report import grid_over
+from tumortrack.registration.frame import grid_over
 from tumortrack_occupancy.volume import (
     drop_islands,
     keep_largest_pieces,

@@ -16,9 +16,9 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import FollowOptions
 from tumortrack.core.geometry import HERE, transform_points
-from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.types import Anatomy, Look, SensorCloud
-from tumortrack.imaging.case import load_case
+from tumortrack.io.case import load_case
+from tumortrack.io.mesh_files import read_mesh
 from tumortrack.report.inspection import describe
 from tumortrack.report.protocol import check_case
 from tumortrack.tracking.model_files import load_model
@@ -177,7 +177,7 @@ def test_labels_volume_and_meshes_lie_in_the_same_place(out):
 
 
 def test_occupancy_cloud_carries_labels_and_probabilities(out):
-    from tumortrack.sense.files import read_cloud
+    from tumortrack.io.depth_files import read_cloud
 
     cloud, _ = read_cloud(out / "occupancy.ply")
     header = (out / "occupancy.ply").read_bytes()[:400].decode("latin-1")

@@ -6,9 +6,9 @@ import pytest
 from render_objects import ELLIPSOIDS, anatomy, winding_number
 from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_query import labels_of, surface_distance
-from tumortrack.simulate.deform.base import View
-from tumortrack.simulate.deform.drag import CONFIGURATIONS, DragConfig
-from tumortrack.simulate.scene import OccupancyConfig
+from tumortrack.simulation.deform.base import View
+from tumortrack.simulation.deform.drag import CONFIGURATIONS, DragConfig
+from tumortrack.simulation.scene import OccupancyConfig
 from tumortrack_occupancy.training.query_points import OccupancyPool
 
 ANATOMY = anatomy()

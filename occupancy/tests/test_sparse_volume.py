@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dense_objects import dense_margins
-from tumortrack.models.report import grid_over
+from tumortrack.registration.frame import grid_over
 from tumortrack_occupancy.sparse import (
     START_MM,
     InterpolationLimit,

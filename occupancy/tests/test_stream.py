@@ -9,12 +9,12 @@ import pytest
 from elastic_objects import SMALL as BODY
 from elastic_objects import UP, organ
 from render_objects import anatomy
-from tumortrack.sense.cloud import CloudConfig
-from tumortrack.sense.noise import D405_NOISE
-from tumortrack.simulate import scene as scene_module
-from tumortrack.simulate.deform import ElasticConfig
-from tumortrack.simulate.elastic.body import build_body
-from tumortrack.simulate.scene import OccupancyConfig, SceneConfig, SceneRecipe, Simulator
+from tumortrack.core.cloud import CloudConfig
+from tumortrack.organ.body import build_body
+from tumortrack.simulation import scene as scene_module
+from tumortrack.simulation.deform import ElasticConfig
+from tumortrack.simulation.noise import D405_NOISE
+from tumortrack.simulation.scene import OccupancyConfig, SceneConfig, SceneRecipe, Simulator
 from tumortrack_occupancy.presets import paper, quick
 from tumortrack_occupancy.training.query_points import OccupancyPool
 from tumortrack_occupancy.training.stream import SceneStream, labelled_scene

@@ -23,7 +23,7 @@ from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.process import available_cores
 from tumortrack.core.types import Anatomy
-from tumortrack.imaging.case import load_case
+from tumortrack.io.case import load_case
 from tumortrack.tracking.model_files import load_model
 from tumortrack_occupancy.config import TrainConfig
 from tumortrack_occupancy.normalisation import CloudBox

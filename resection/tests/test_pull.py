@@ -18,11 +18,11 @@ from tumortrack.core import store
 from tumortrack.core.errors import NoPlan
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.report import NextEvidence
-from tumortrack.imaging.case import load_case
+from tumortrack.io.case import load_case
+from tumortrack.io.ply import write_cloud_ply
 from tumortrack.live.spec import SOURCES
 from tumortrack.live.values import PublishedFrame
-from tumortrack.sense.ply import write_cloud_ply
-from tumortrack.sense.region import Hints, organ_points
+from tumortrack.segmentation import Hints, organ_points
 from tumortrack.tracking.tracker import region_for
 from tumortrack_devices.pulled import PulledStates
 from tumortrack_resection.arms import procedure as arms_procedure

@@ -34,12 +34,12 @@ from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.halt import CUT_NOTE
-from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import CameraLabels, OccupancyCloud
-from tumortrack.imaging.case import load_case
-from tumortrack.sense.ply import parse_ply_properties, write_cloud_ply
-from tumortrack.tracking.files import write_estimate
+from tumortrack.io.case import load_case
+from tumortrack.io.mesh_files import read_mesh, write_mesh
+from tumortrack.io.ply import parse_ply_properties, write_cloud_ply
+from tumortrack.io.run_folder import write_estimate
 from tumortrack_resection import begin_plan, begin_resection, plan_resection
 from tumortrack_resection.arms.body import cell_urdf
 from tumortrack_resection.files import read_plan

@@ -15,7 +15,7 @@ from safetensors.numpy import load_file, save_file
 from plan_objects import located, sphere
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError, NoPlan
-from tumortrack.core.mesh_files import write_mesh
+from tumortrack.io.mesh_files import write_mesh
 from tumortrack.live.values import PublishedFrame
 from tumortrack_devices.ros.messages import Messages
 from tumortrack_resection import begin_resection

@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from tumortrack.core.types import Intrinsics as Intrinsics
     from tumortrack.core.types import Look as Look
     from tumortrack.core.types import SensorCloud as SensorCloud
-    from tumortrack.imaging.case import Case as Case
-    from tumortrack.imaging.case import load_case as load_case
+    from tumortrack.io.case import Case as Case
+    from tumortrack.io.case import load_case as load_case
     from tumortrack.report.inspection import describe as describe
-    from tumortrack.simulate import datasets as datasets
+    from tumortrack.simulation import datasets as datasets
     from tumortrack.tracking import presets as presets
     from tumortrack.tracking.tracker import Tracker as Tracker
 
@@ -41,11 +41,11 @@ _NAMES = {  # by the module that has them
     "core.estimate": "Estimate",
     "core.evidence": "Free Held Landmark Outline Touch",
     "core.types": "DepthFrame Intrinsics Look SensorCloud",
-    "imaging.case": "Case load_case",
+    "io.case": "Case load_case",
     "report.inspection": "describe",
     "assessment.advice": "advise",
     "tracking.tracker": "Tracker",
-    "simulate": "datasets",
+    "simulation": "datasets",
     "tracking": "presets",
 }
 _HOMES = {name: home for home, names in _NAMES.items() for name in names.split()}

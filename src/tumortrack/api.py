@@ -23,8 +23,8 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
-from tumortrack.imaging.case import Case
-from tumortrack.imaging.case import load_case as load_case
+from tumortrack.io.case import Case
+from tumortrack.io.case import load_case as load_case
 from tumortrack.tracking.keywords import (
     ExportKeywords,
     LocateKeywords,
@@ -44,13 +44,13 @@ from tumortrack.tracking.options import (
 )
 
 if TYPE_CHECKING:
+    from tumortrack.io.scene_folder import Scene
     from tumortrack.live.session import Arms, Session
     from tumortrack.live.values import TrackingResult
-    from tumortrack.models.method import TrainingStatus
-    from tumortrack.models.model import Model, ModelConfig
+    from tumortrack.registration.base_model import Model, ModelConfig
+    from tumortrack.registration.method import TrainingStatus
     from tumortrack.report.locating import Located
-    from tumortrack.sense.region.tissue import TissueClassifier
-    from tumortrack.simulate.scene_folder import Scene
+    from tumortrack.segmentation.tissue import TissueClassifier
     from tumortrack.tracking.tracker import Tracker
 
 _QC = "qc.png"
@@ -61,7 +61,7 @@ def scan_phantom(
 ) -> Path:
     """Write a virtual CT of the built-in kidney phantom as a DICOM series, if none is there;
     returns the folder, which ``prepare`` reads."""
-    from tumortrack.phantom import dicom, digital, scanner
+    from tumortrack.simulation.phantom import dicom, digital, scanner
 
     folder = Path(folder)
     if not folder.exists():
@@ -93,10 +93,10 @@ def prepare(
         progress: of making the case's model, as its last step: steps done, of how many.
         options: as `tumortrack prepare --help` explains them.
     """
-    from tumortrack.imaging import prepare as preparing
-    from tumortrack.imaging.case import KIND, save_case
-    from tumortrack.imaging.options import PrepareOptions
-    from tumortrack.models.folder import weakness_of
+    from tumortrack.case import prepare as preparing
+    from tumortrack.case.options import PrepareOptions
+    from tumortrack.io.case import KIND, save_case
+    from tumortrack.io.model_folder import weakness_of
     from tumortrack.tracking.model_files import case_model
 
     asked = options_from(PrepareOptions, {**options}, "prepare")
@@ -109,7 +109,7 @@ def prepare(
     elif folder is None or len(sources) != 1:
         raise InputError("segment needs a folder, beside which the one CT's label map is kept.")
     else:
-        from tumortrack.imaging.segmentation_tool import segmented_case
+        from tumortrack.case.segmentation_tool import segmented_case
 
         keep = Path(folder).with_name(f"{Path(folder).name}.labels.nii.gz")
         case = segmented_case(sources[0], segment, asked, keep)
@@ -139,7 +139,7 @@ def _draw_case(case: Case, folder: Path, weakness: str = "") -> None:
 
 def _warning_in_picture(case: Case, weakness: str, model: Model) -> Case:
     """The case in its folder's place, with the same files but for the picture, and the model."""
-    from tumortrack.models.folder import save_model
+    from tumortrack.io.model_folder import save_model
 
     assert case.folder is not None
     manifest = store.read_json(case.folder / store.MANIFEST)
@@ -171,7 +171,7 @@ def simulate_scenes(
     """
     from msgspec.structs import replace
 
-    from tumortrack.simulate.dataset import scene_maker
+    from tumortrack.simulation.dataset import scene_maker
 
     case = case if isinstance(case, Case) else load_case(case)
     config = SimulateOptions(elastic=elastic, noise=noise).scene_config()
@@ -196,7 +196,7 @@ def write_scenes(
         progress: called after each scene.
         options: as `tumortrack simulate --help` explains them.
     """
-    from tumortrack.simulate import dataset
+    from tumortrack.simulation import dataset
 
     asked = options_from(SimulateOptions, {**options}, "write_scenes")
     made_of = load_case(case)
@@ -265,9 +265,9 @@ def train(
         report: of a training: called every few seconds.
         progress: of making a model that learns nothing: steps done, of how many.
     """
-    from tumortrack.models.folder import check_trainable
-    from tumortrack.models.method import TrainOptions, method_of_config, method_of_preset
+    from tumortrack.io.model_folder import check_trainable
     from tumortrack.registration.config import RegistrationConfig
+    from tumortrack.registration.method import TrainOptions, method_of_config, method_of_preset
     from tumortrack.tracking.model_files import write_model
     from tumortrack.tracking.presets import PRESETS, seen_by
 
@@ -312,8 +312,8 @@ def load_model(folder: StrPath, device: Device = "auto") -> Model:
 def read_cloud(path: StrPath, unit: Literal["mm", "m"] = "mm") -> SensorCloud:
     """A cloud in the camera frame from .ply, .pcd or .npz; what was dropped is a warning. Raises
     InputError: missing, damaged, of another kind, in metres, or without any point."""
-    from tumortrack.sense import files
-    from tumortrack.sense.cloud import check_cloud
+    from tumortrack.core.cloud import check_cloud
+    from tumortrack.io import depth_files as files
 
     cloud, notes = files.read_cloud(Path(path), unit)
     for note in notes:
@@ -331,7 +331,7 @@ def read_depth(path: StrPath, intrinsics: StrPath, unit_mm: float | None = None)
         unit_mm: of one step. Default: what that file says (depth_unit_mm), else 0.1 (a D405's), of
             floats 1000 (metres). Many cameras have 1.
     """
-    from tumortrack.sense import files
+    from tumortrack.io import depth_files as files
 
     return files.read_depth(Path(path), Path(intrinsics), unit_mm)[0]
 
@@ -364,8 +364,8 @@ def find_organ(
             was taught cannot be used on this picture.
         InputError: an option that is not allowed.
     """
-    from tumortrack.models.model import Model
-    from tumortrack.sense.region import Hints, organ_points
+    from tumortrack.registration.base_model import Model
+    from tumortrack.segmentation import Hints, organ_points
     from tumortrack.tracking.model_files import case_model
     from tumortrack.tracking.tracker import region_for
 
@@ -393,7 +393,7 @@ def teach(
     """What the organ looks like in colour and depth, from pixels (row, column) on it and beside it,
     two of each at least; for ``find_organ``. Raises InputError: a pixel shows too little, or organ
     and surroundings look alike."""
-    from tumortrack.sense.region import tissue
+    from tumortrack.segmentation import tissue
 
     pixels = [(pixel, True) for pixel in organ] + [(pixel, False) for pixel in beside]
     return tissue.teach([tissue.sample_click(frame, picture, *pixel) for pixel in pixels])
@@ -453,7 +453,7 @@ def load_estimate(folder: StrPath) -> Estimate:
     """Read a folder that ``save_estimate`` or `tumortrack locate` wrote; its ``motion`` is None:
     only the model knows that. Raises ArtifactError: no such folder, damaged or changed, or nothing
     was located in it."""
-    from tumortrack.tracking.files import read_estimate
+    from tumortrack.io.run_folder import read_estimate
 
     return read_estimate(Path(folder))
 
@@ -464,7 +464,7 @@ def estimate_from_surfaces(surfaces: Mapping[str, Mesh], grid: int = 160) -> Est
     includes its tumors. They are taken as right: nothing judges them. ``grid``: voxels along the
     longest side of the labelled volume.
     """
-    from tumortrack.models.report import estimate_of
+    from tumortrack.registration.frame import estimate_of
 
     return estimate_of(dict(surfaces), grid).assessed(finding=None)
 

@@ -22,12 +22,12 @@ from tumortrack.assessment.bound import (
     figures,
     shipped,
 )
+from tumortrack.assessment.fingerprint import fingerprint
 from tumortrack.assessment.sight import Sight
 from tumortrack.assessment.verdict import finding_of
 from tumortrack.core.assessment import ErrorBound
 from tumortrack.core.types import DepthError, Look, SensorCloud
-from tumortrack.models.report import estimate_of
-from tumortrack.tracking.fingerprint import fingerprint
+from tumortrack.registration.frame import estimate_of
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from warp_objects import ANATOMY, placed

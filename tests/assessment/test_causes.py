@@ -11,17 +11,17 @@ from scipy.spatial.transform import Rotation
 
 from live_objects import small_estimate
 from tumortrack.assessment.causes import explained, likely_causes, words
+from tumortrack.case.surface import surfaces
 from tumortrack.core.assessment import Assessment
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import HERE
 from tumortrack.core.report import Cause, EvidenceReport, Likely
 from tumortrack.core.types import Anatomy, Look, PointNoise, SensorCloud
-from tumortrack.imaging.surface import surfaces
-from tumortrack.phantom.digital import PhantomParameters, phantom_labels
-from tumortrack.sense.units import Unit
-from tumortrack.simulate.deform import DragConfig
-from tumortrack.simulate.scene import SceneRecipe, Simulator
-from tumortrack.tracking.files import report_entry
+from tumortrack.core.units import Unit
+from tumortrack.io.run_folder import report_entry
+from tumortrack.simulation.deform import DragConfig
+from tumortrack.simulation.phantom.digital import PhantomParameters, phantom_labels
+from tumortrack.simulation.scene import SceneRecipe, Simulator
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 

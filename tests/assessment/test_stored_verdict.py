@@ -13,7 +13,7 @@ from tumortrack.core import store
 from tumortrack.core.assessment import Assessment, ErrorBound
 from tumortrack.core.report import Cause, Finding, Likely, NextEvidence
 from tumortrack.core.types import CameraLabels
-from tumortrack.tracking.files import write_estimate
+from tumortrack.io.run_folder import write_estimate
 
 VOLUME = CameraLabels(np.ones((4, 4, 4), np.uint8), np.eye(4))
 

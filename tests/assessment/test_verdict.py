@@ -16,14 +16,14 @@ from tumortrack.assessment.sight import Sight, cloud_shares, seen_through
 from tumortrack.assessment.verdict import Disputes, finding_of, judged
 from tumortrack.core import store
 from tumortrack.core.assessment import ErrorBound
+from tumortrack.core.camera import d405, deproject
 from tumortrack.core.errors import NoEstimate
+from tumortrack.core.render import render_depth
 from tumortrack.core.report import EvidenceReport
 from tumortrack.core.types import DepthFrame, Mesh, PointNoise, SensorCloud
-from tumortrack.models.folder import weakness_of
+from tumortrack.io.model_folder import weakness_of
 from tumortrack.registration.motion import ElasticMotion
-from tumortrack.sense.camera import d405, deproject
-from tumortrack.sense.render import render_depth
-from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
+from tumortrack.simulation.scene import SceneRecipe, Simulator, body_for
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from warp_objects import ANATOMY, PLACE_MM, TURNED, slim_clinic

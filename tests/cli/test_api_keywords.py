@@ -5,7 +5,7 @@ from typing import get_type_hints
 import pytest
 
 import tumortrack as tt
-from tumortrack.imaging.options import PrepareOptions
+from tumortrack.case.options import PrepareOptions
 from tumortrack.tracking import keywords
 from tumortrack.tracking.options import (
     ExportOptions,

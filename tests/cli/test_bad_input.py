@@ -11,14 +11,14 @@ import trimesh
 import tyro
 
 from stories import refusal, tumortrack
+from tumortrack.case.options import PrepareOptions
+from tumortrack.case.prepare import prepare
 from tumortrack.cli.cases import Prepare
 from tumortrack.cli.demo import Demo
 from tumortrack.cli.main import run
 from tumortrack.cli.training import Train
 from tumortrack.core.errors import InputError
 from tumortrack.core.packages import to_install
-from tumortrack.imaging.options import PrepareOptions
-from tumortrack.imaging.prepare import prepare
 
 
 def _nifti(path: Path, array: np.ndarray) -> Path:
@@ -96,7 +96,7 @@ def test_an_unreadable_input_is_named_and_no_folder_stays(tmp_path, monkeypatch)
     def refuse(*_: object) -> None:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("tumortrack.imaging.volume.read_raw", refuse)
+    monkeypatch.setattr("tumortrack.io.volume.read_raw", refuse)
     with pytest.raises(InputError, match=r"ball\.nii"):
         Prepare(input=source, case=tmp_path / "new" / "dir" / "case").run()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["ball.nii"]
@@ -108,7 +108,7 @@ def test_an_unreadable_input_is_named_and_no_folder_stays(tmp_path, monkeypatch)
 def test_the_papers_method_names_its_package_where_it_is_not_installed(
     arguments, phantom_case, tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr("tumortrack.models.method.entry_points", lambda group: [])
+    monkeypatch.setattr("tumortrack.registration.method.entry_points", lambda group: [])
     out = str(tmp_path / "out")
     places = ["--out", out] if arguments[0] == "demo" else [str(phantom_case), out]
     assert run([*arguments, *places]) == 2
@@ -141,7 +141,7 @@ def test_the_demo_replaces_nothing_but_a_demo(tmp_path, monkeypatch):
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("tumortrack.phantom.scanner.scan", stop)
+    monkeypatch.setattr("tumortrack.simulation.phantom.scanner.scan", stop)
     mine = tmp_path / "mine"
     (mine / "case").mkdir(parents=True)
     (mine / "case" / "dear.txt").write_text("dear")

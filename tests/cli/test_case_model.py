@@ -13,11 +13,11 @@ from tumortrack import api
 from tumortrack.cli.main import run
 from tumortrack.core import store
 from tumortrack.core.errors import StorageError
-from tumortrack.imaging.case import load_case
-from tumortrack.imaging.nifti import write_nifti
-from tumortrack.models.folder import read_model_manifest, weakness_of
+from tumortrack.io.case import load_case
+from tumortrack.io.model_folder import read_model_manifest, weakness_of
+from tumortrack.io.nifti import write_nifti
+from tumortrack.io.ply import write_cloud_ply
 from tumortrack.report.inspection import describe
-from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.tracking import model_files
 from warp_objects import slim_clinic
 
@@ -210,7 +210,7 @@ def test_the_picture_of_a_case_tells_how_weak_its_model_is(
         "tumortrack.report.pictures.qc_picture",
         lambda *given: [given[3].write_text(str(given[5])), drawn.append(given[5])],
     )
-    monkeypatch.setattr("tumortrack.models.folder.weakness_of", lambda about: weakness)
+    monkeypatch.setattr("tumortrack.io.model_folder.weakness_of", lambda about: weakness)
     monkeypatch.setattr(model_files, "clinic", lambda *_: slim_clinic())
     made = api.prepare(phantom_case / "labels.nii.gz", tmp_path / "case")
     before, *after = drawn

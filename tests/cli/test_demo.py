@@ -8,10 +8,10 @@ import pytest
 
 from stories import succeeded, tumortrack
 from tumortrack.core import store
-from tumortrack.imaging.case import load_case
+from tumortrack.io.case import load_case
+from tumortrack.io.scene_folder import list_scenes, read_scene
 from tumortrack.report.inspection import describe
-from tumortrack.simulate import datasets
-from tumortrack.simulate.scene_folder import list_scenes, read_scene
+from tumortrack.simulation import datasets
 
 pytestmark = pytest.mark.slow
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.mesh_query import surface_distance
-from tumortrack.imaging.case import load_case
-from tumortrack.simulate.scene_folder import read_scene
+from tumortrack.io.case import load_case
+from tumortrack.io.mesh_files import read_mesh
+from tumortrack.io.scene_folder import read_scene
 
 pytestmark = pytest.mark.slow
 

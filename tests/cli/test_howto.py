@@ -16,8 +16,8 @@ import pytest
 from stories import cloud_by_rays, looking_down
 from tumortrack.cli.main import run
 from tumortrack.core.geometry import transform_points
-from tumortrack.imaging.case import Case, load_case
-from tumortrack.sense.ply import write_cloud_ply
+from tumortrack.io.case import Case, load_case
+from tumortrack.io.ply import write_cloud_ply
 
 PAGES = sorted((Path(__file__).parents[2] / "docs" / "how-to").glob("*.md"))
 LEFT = {  # what a page's commands leave behind, besides what they print

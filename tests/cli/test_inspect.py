@@ -10,13 +10,13 @@ import pytest
 
 from stories import refusal, tumortrack
 from tumortrack.core import store
+from tumortrack.core.camera import d405
 from tumortrack.core.errors import InputError
-from tumortrack.core.mesh_files import write_mesh
 from tumortrack.core.types import DepthFrame, Mesh
+from tumortrack.io.depth_files import depth_png, intrinsics_json
+from tumortrack.io.mesh_files import write_mesh
+from tumortrack.io.ply import write_cloud_ply
 from tumortrack.report.inspection import describe
-from tumortrack.sense.camera import d405
-from tumortrack.sense.files import depth_png, intrinsics_json
-from tumortrack.sense.ply import write_cloud_ply
 
 PATIENT = {"id": "P1", "side": "left"}
 PARTS = {

@@ -18,15 +18,15 @@ from reports import advised, reporting
 from stories import answered, refusal, tumortrack
 from tumortrack.cli.main import run
 from tumortrack.core import colours
+from tumortrack.core.camera import d405
+from tumortrack.core.cloud import check_depth_unit
 from tumortrack.core.errors import StorageError
 from tumortrack.core.report import Finding
 from tumortrack.core.types import Intrinsics
-from tumortrack.imaging.case import load_case
+from tumortrack.io.case import load_case
+from tumortrack.io.depth_files import depth_png, intrinsics_json, read_mask
 from tumortrack.report.page import write_run_page
 from tumortrack.report.seen import PAGE, PICTURE, Seen
-from tumortrack.sense.camera import d405
-from tumortrack.sense.cloud import check_depth_unit
-from tumortrack.sense.files import depth_png, intrinsics_json, read_mask
 
 HAND = Props(tilt_degrees=20, waves_mm=3, hand=True, up=(0.0, -1.0, 0.0), distance_mm=(115, 135))
 
@@ -137,7 +137,7 @@ def test_the_verdict_is_said_before_anything_is_written(raw, clinic_model, monke
         said.append(capsys.readouterr().out)
         raise StorageError("the disk is full.")
 
-    monkeypatch.setattr("tumortrack.tracking.files.write_estimate", full)
+    monkeypatch.setattr("tumortrack.io.run_folder.write_estimate", full)
     command = ("locate", clinic_model, raw / "depth.png", raw / "run")
     command = (*command, "--intrinsics", raw / "camera.json")
     assert run([str(part) for part in command]) == StorageError.exit_code == 2

@@ -10,8 +10,8 @@ import pytest
 from stories import answered, cloud_by_rays, looking_down, refusal, succeeded, tumortrack
 from tumortrack.core import store
 from tumortrack.core.patient import Patient
-from tumortrack.imaging.case import load_case
-from tumortrack.sense.ply import write_cloud_ply
+from tumortrack.io.case import load_case
+from tumortrack.io.ply import write_cloud_ply
 from tumortrack_resection.files import read_plan
 
 P1 = {"id": "P1", "side": "right"}  # of ``phantom_case``

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from stories import answered, refusal, succeeded, tumortrack
+from tumortrack.case.prepare import prepare
 from tumortrack.cli.main import run
-from tumortrack.core.mesh_files import read_mesh
-from tumortrack.imaging.case import load_case
-from tumortrack.imaging.prepare import prepare
-from tumortrack.imaging.volume import read_labels
-from tumortrack.phantom.dicom import write_dicom_series
-from tumortrack.phantom.scanner import ScannerParameters, scan
+from tumortrack.io.case import load_case
+from tumortrack.io.mesh_files import read_mesh
+from tumortrack.io.volume import read_labels
+from tumortrack.simulation.phantom.dicom import write_dicom_series
+from tumortrack.simulation.phantom.scanner import ScannerParameters, scan
 
 
 def locates_its_organ(case: Path, folder: Path) -> None:

@@ -11,8 +11,8 @@ import pytest
 
 from stories import cloud_by_rays, looking_down, with_imports
 from tumortrack.cli import main
-from tumortrack.imaging.case import load_case
-from tumortrack.sense.ply import write_cloud_ply
+from tumortrack.io.case import load_case
+from tumortrack.io.ply import write_cloud_ply
 
 
 @pytest.fixture

@@ -95,7 +95,7 @@ def test_the_wheel_holds_the_package_alone(wheel):
         r"-py3-none-linux_\w+\.whl", wheel.name
     )  # for any Python, this kind of machine
     (scenes,) = (name for name in names if name.endswith(".safetensors"))  # nothing is learnt
-    assert scenes == "tumortrack/simulate/phantom_scenes.safetensors"
+    assert scenes == "tumortrack/simulation/phantom_scenes.safetensors"
     assert zipfile.ZipFile(wheel).getinfo(scenes).compress_size < 5_000_000
     assert any(name.endswith("LICENSE") for name in names)
 

@@ -11,8 +11,8 @@ import pytest
 from stories import answered, cloud_by_rays, environment, looking_down, refusal, succeeded
 from tumortrack.core import store
 from tumortrack.core.packages import to_install
-from tumortrack.imaging.case import load_case
-from tumortrack.sense.ply import write_cloud_ply
+from tumortrack.io.case import load_case
+from tumortrack.io.ply import write_cloud_ply
 
 WITHOUT = """
 import sys

@@ -10,7 +10,7 @@ from skimage.color import deltaE_ciede2000, rgb2lab
 
 from tumortrack.core import colours
 from tumortrack.core.colours import name_colour, part_colour
-from tumortrack.imaging.segmentation_files import segments
+from tumortrack.io.segmentation_files import segments
 
 # Linear RGB as it is seen without one kind of cone: Machado, Oliveira, Fernandes 2009, doi
 # 10.1109/TVCG.2009.113, severity 1.0.

@@ -10,9 +10,9 @@ import pytest
 import trimesh
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.mesh_query import exact_margin, nearest_places
 from tumortrack.core.types import Mesh
+from tumortrack.io.mesh_files import read_mesh, write_mesh
 
 
 @pytest.fixture

@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 
 from organ_objects import liver, prostate
+from tumortrack.case.options import PrepareOptions
+from tumortrack.case.prepare import prepare
+from tumortrack.case.select import select_labels
+from tumortrack.case.surface import surfaces
 from tumortrack.core.errors import ArtifactError, InputError
-from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.organ import KIDNEY, Organ, organ_first, organ_name
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import Anatomy, LabelVolume
-from tumortrack.imaging.case import Case, load_case, save_case
-from tumortrack.imaging.options import PrepareOptions
-from tumortrack.imaging.prepare import prepare
-from tumortrack.imaging.segmentation_files import segments
-from tumortrack.imaging.select import select_labels
-from tumortrack.imaging.surface import surfaces
-from tumortrack.simulate.scene import SceneConfig
-from tumortrack.simulate.scene_folder import organ_of_folder
+from tumortrack.io.case import Case, load_case, save_case
+from tumortrack.io.mesh_files import write_anatomy
+from tumortrack.io.scene_folder import organ_of_folder
+from tumortrack.io.segmentation_files import segments
+from tumortrack.simulation.scene import SceneConfig
 
 LIVER = Organ(name="liver")
 UP = (0.0, -1.0, 0.0)

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 PROGRAM = """
-from tumortrack.core.pydicom_library import load_pydicom
+from tumortrack.io.pydicom_library import load_pydicom
 load_pydicom()
 import dl, pydicom
 print(getattr(dl, "MINE", "a folder"))

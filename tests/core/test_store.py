@@ -13,8 +13,8 @@ import trimesh
 
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError, StorageError
-from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.types import Mesh
+from tumortrack.io.mesh_files import read_mesh, write_mesh
 
 
 def box(extents=(2, 3, 4), center=(0, 0, 0)):

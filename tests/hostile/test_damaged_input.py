@@ -30,8 +30,8 @@ from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.evidence import Free, Outline, Touch
-from tumortrack.core.evidence_files import evidence_json
 from tumortrack.core.types import Volume
+from tumortrack.io.evidence_files import evidence_json
 
 EXAMPLES, EXAMPLES_A_TIME = 40, 500  # of each reader; and with --attack TIMES
 SECONDS, MEGABYTES = 5, 1024
@@ -161,18 +161,18 @@ KIT = {
 # What reads it, by the file's name, and valid contents.
 FILES: dict[str, tuple[str, tuple[object, ...]]] = {
     "in.ply": (
-        "tumortrack.sense.files:read_cloud",
+        "tumortrack.io.depth_files:read_cloud",
         (ply(POINTS), ASCII_PLY + b"end_header\n1.5 2 150\n"),
     ),
-    "in.pcd": ("tumortrack.sense.files:read_cloud", (pcd(count=40) + POINTS.tobytes(),)),
-    "in.npz": ("tumortrack.sense.files:read_cloud", (npz(points_mm=POINTS),)),
-    "in.npy": ("tumortrack.sense.files:read_cloud", (npy(POINTS),)),
-    "intrinsics.json": ("tumortrack.sense.files:read_intrinsics", (CAMERA,)),
+    "in.pcd": ("tumortrack.io.depth_files:read_cloud", (pcd(count=40) + POINTS.tobytes(),)),
+    "in.npz": ("tumortrack.io.depth_files:read_cloud", (npz(points_mm=POINTS),)),
+    "in.npy": ("tumortrack.io.depth_files:read_cloud", (npy(POINTS),)),
+    "intrinsics.json": ("tumortrack.io.depth_files:read_intrinsics", (CAMERA,)),
     "stereo.yaml": ("tumortrack_devices.stereo:read_calibration", ()),
-    "in.nii": ("tumortrack.imaging.volume:read_raw", (NIFTI,)),
-    "in.nii.gz": ("tumortrack.imaging.volume:read_raw", (gzip.compress(NIFTI, mtime=0),)),
+    "in.nii": ("tumortrack.io.volume:read_raw", (NIFTI,)),
+    "in.nii.gz": ("tumortrack.io.volume:read_raw", (gzip.compress(NIFTI, mtime=0),)),
     "in.nrrd": (
-        "tumortrack.imaging.volume:read_raw",
+        "tumortrack.io.volume:read_raw",
         (
             nrrd("12 12 12", "encoding: raw", VOXELS),
             nrrd("12 12 12", "encoding: gzip", gzip.compress(VOXELS, mtime=0)),
@@ -180,14 +180,14 @@ FILES: dict[str, tuple[str, tuple[object, ...]]] = {
     ),
     **{
         f"mesh.{kind}": (
-            "tumortrack.core.mesh_files:read_mesh",
+            "tumortrack.io.mesh_files:read_mesh",
             (sphere(30).export(file_type=kind),),
         )
         for kind in ("stl", "ply", "obj")
     },
-    "points.csv": ("tumortrack.tracking.points:read_points", ("x,y,z\n1,2,3\n4,5,6\n",)),
-    "points.mrk.json": ("tumortrack.tracking.points:read_points", (MARKUPS,)),
-    "points.fcsv": ("tumortrack.tracking.points:read_points", (FCSV,)),
+    "points.csv": ("tumortrack.io.points:read_points", ("x,y,z\n1,2,3\n4,5,6\n",)),
+    "points.mrk.json": ("tumortrack.io.points:read_points", (MARKUPS,)),
+    "points.fcsv": ("tumortrack.io.points:read_points", (FCSV,)),
     "evidence.json": ("tumortrack.core.evidence:read_evidence", ()),
     "evidence.csv": ("tumortrack.core.evidence:read_evidence", (EVIDENCE_TABLE,)),
     "calibration.json": (
@@ -222,7 +222,7 @@ def test_files(name, tmp_path, times):
 
 
 def test_depth_images(tmp_path, times):
-    from tumortrack.sense.files import read_depth_png
+    from tumortrack.io.depth_files import read_depth_png
 
     camera = tmp_path / "intrinsics.json"
     camera.write_text(json.dumps(CAMERA))
@@ -231,7 +231,7 @@ def test_depth_images(tmp_path, times):
 
 
 def test_poses_of_views(tmp_path, times):
-    from tumortrack.sense.files import read_poses
+    from tumortrack.io.depth_files import read_poses
 
     poses = {"fixed_from_camera": [TURN, TURN], "unit": "m", "frame_id": "base_link"}
     read = partial(of_file, tmp_path / "in.json", lambda path: read_poses(path, 2))
@@ -261,8 +261,8 @@ def test_dicom_slices(syntax, tmp_path, times):
     from pydicom.encaps import encapsulate, get_frame
 
     from dicom_objects import packed, write_slices
-    from tumortrack.imaging.dicom import read_dicom
-    from tumortrack.phantom.dicom import write_dicom_series
+    from tumortrack.io.dicom import read_dicom
+    from tumortrack.simulation.phantom.dicom import write_dicom_series
 
     def read(path: Path) -> object:
         return read_dicom(path.parent, "1")
@@ -387,9 +387,9 @@ def test_recordings(kind, tmp_path, times):
 MEMBERS = [
     (reader, folder, name)
     for reader, folder, names in (
-        ("tumortrack.imaging.case:load_case", "case", ("manifest.json", "tumor_1.ply")),
+        ("tumortrack.io.case:load_case", "case", ("manifest.json", "tumor_1.ply")),
         (
-            "tumortrack.simulate.scene_folder:read_scene",
+            "tumortrack.io.scene_folder:read_scene",
             "scenes/0000",
             ("meta.json", "targets.csv"),
         ),

@@ -215,7 +215,7 @@ def without(name: str) -> Make:
 
 def nearer_tumor(folder: Path) -> None:
     """The tumor that is cut out lies 2 mm nearer to the first facet."""
-    from tumortrack.core.mesh_files import read_mesh, write_mesh
+    from tumortrack.io.mesh_files import read_mesh, write_mesh
 
     planned = json.loads((folder / "plan.json").read_text())["plan"]
     path = folder / f"{planned['tumor']}.ply"

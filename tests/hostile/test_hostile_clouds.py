@@ -37,7 +37,7 @@ def file(content: Callable[[], bytes], name: str = "in.ply") -> Make:
 
 def cloud(change: Callable[[np.ndarray, np.random.Generator], Any]) -> Make:
     """A right cloud that was changed."""
-    from tumortrack.sense.files import read_cloud
+    from tumortrack.io.depth_files import read_cloud
 
     def changed(room: Room) -> object:
         points = np.array(read_cloud(room.cloud)[0].points_mm)

@@ -201,7 +201,7 @@ def dicom(
         import pydicom
 
         from tumortrack.core.types import Volume
-        from tumortrack.phantom.dicom import write_dicom_series
+        from tumortrack.simulation.phantom.dicom import write_dicom_series
 
         hu = np.where(ball() > 0, 100.0, -1000.0).astype(np.float32)
         hu[16:22, 16:22, 16:22] = 500

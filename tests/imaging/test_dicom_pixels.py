@@ -7,7 +7,7 @@ from pydicom.encaps import encapsulate, get_frame
 
 from dicom_objects import SYNTAXES, packed, write_slices
 from tumortrack.core.errors import InputError
-from tumortrack.imaging.dicom import read_dicom
+from tumortrack.io.dicom import read_dicom
 
 COMPRESSED = ("rle", "jpeg lossless", "jpeg-ls", "jpeg 2000")
 

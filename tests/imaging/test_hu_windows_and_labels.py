@@ -5,13 +5,13 @@ import pytest
 from scipy import ndimage
 
 from imaging_objects import kidney_labels
+from tumortrack.case.hu_windows import segment_ct
+from tumortrack.case.select import select_labels
+from tumortrack.case.surface import surfaces
 from tumortrack.core.errors import InputError
+from tumortrack.core.grid import voxel_ml
 from tumortrack.core.report import Finding
 from tumortrack.core.types import LabelVolume, Volume
-from tumortrack.imaging.grid import voxel_ml
-from tumortrack.imaging.hu_windows import segment_ct
-from tumortrack.imaging.select import select_labels
-from tumortrack.imaging.surface import surfaces
 
 
 def volumes(labels: LabelVolume) -> np.ndarray:

@@ -5,10 +5,10 @@ import pytest
 import trimesh
 
 from imaging_objects import OBLIQUE
+from tumortrack.case.meshes import is_simple, label_meshes, read_meshes
 from tumortrack.core.errors import InputError
+from tumortrack.core.raster import winding_numbers
 from tumortrack.core.types import Mesh
-from tumortrack.imaging.meshes import is_simple, label_meshes, read_meshes
-from tumortrack.imaging.raster import winding_numbers
 
 
 def ball(radius, centre, stretch=(1.0, 1.0, 1.0)):

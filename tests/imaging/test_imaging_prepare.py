@@ -12,16 +12,16 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from imaging_objects import kidney_labels, write_dicom, write_nifti, write_nrrd
+from tumortrack.case.meshes import read_meshes
+from tumortrack.case.options import PrepareOptions
+from tumortrack.case.prepare import prepare
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import LabelVolume, Volume
-from tumortrack.imaging.case import load_case, save_case
-from tumortrack.imaging.meshes import read_meshes
-from tumortrack.imaging.options import PrepareOptions
-from tumortrack.imaging.prepare import prepare
-from tumortrack.imaging.volume import read_labels, read_raw, read_volume
-from tumortrack.phantom.dicom import write_dicom_series
+from tumortrack.io.case import load_case, save_case
+from tumortrack.io.volume import read_labels, read_raw, read_volume
+from tumortrack.simulation.phantom.dicom import write_dicom_series
 
 
 def ct_of(labels: LabelVolume) -> np.ndarray:

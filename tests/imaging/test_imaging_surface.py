@@ -5,11 +5,11 @@ import pytest
 import trimesh
 
 from imaging_objects import OBLIQUE, kidney_labels
+from tumortrack.case.prepare import prepare
+from tumortrack.case.surface import surfaces
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import LabelVolume
-from tumortrack.imaging.nifti import write_nifti
-from tumortrack.imaging.prepare import prepare
-from tumortrack.imaging.surface import surfaces
+from tumortrack.io.nifti import write_nifti
 
 
 def solid(mesh):

@@ -20,8 +20,8 @@ from imaging_objects import (
 )
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm
-from tumortrack.imaging import nifti
-from tumortrack.imaging.volume import is_label_map, read_labels, read_raw, read_volume
+from tumortrack.io import nifti
+from tumortrack.io.volume import is_label_map, read_labels, read_raw, read_volume
 
 GRIDS = {
     "LPS": affine_lps("LPS", (0.9, 1.0, 0.8), np.eye(3)),

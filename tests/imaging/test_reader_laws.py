@@ -16,21 +16,21 @@ import pytest
 import trimesh
 
 from imaging_objects import kidney_labels, write_dicom, write_nifti
+from tumortrack.case.options import PrepareOptions
+from tumortrack.case.prepare import prepare
+from tumortrack.case.surface import surface_of
 from tumortrack.core import store
 from tumortrack.core.config import findings_in
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, transform_points
-from tumortrack.core.mesh_files import write_mesh
 from tumortrack.core.types import LabelVolume, Volume
-from tumortrack.imaging.case import load_case, save_case
-from tumortrack.imaging.options import PrepareOptions
-from tumortrack.imaging.prepare import prepare
-from tumortrack.imaging.segmentation_files import segments, write_dicom_seg
-from tumortrack.imaging.segments import is_organ, is_tumor
-from tumortrack.imaging.surface import surface_of
-from tumortrack.imaging.volume import read_raw, read_several
-from tumortrack.phantom.dicom import write_dicom_series
-from tumortrack.phantom.digital import PhantomParameters, phantom_labels
+from tumortrack.io.case import load_case, save_case
+from tumortrack.io.mesh_files import write_mesh
+from tumortrack.io.segmentation_files import segments, write_dicom_seg
+from tumortrack.io.segments import is_organ, is_tumor
+from tumortrack.io.volume import read_raw, read_several
+from tumortrack.simulation.phantom.dicom import write_dicom_series
+from tumortrack.simulation.phantom.digital import PhantomParameters, phantom_labels
 
 VOXEL_MM = 2.4
 KIDNEY_ML, TUMORS_ML = 185.15, (28.8, 17.1)  # of the labels
@@ -162,7 +162,7 @@ def kinds(case) -> dict[str, dict]:
 @pytest.fixture(autouse=True)
 def without_half_turns(monkeypatch):
     """They take as long as all else and are tested elsewhere."""
-    monkeypatch.setattr("tumortrack.imaging.prepare.half_turns", lambda _: [])
+    monkeypatch.setattr("tumortrack.case.prepare.half_turns", lambda _: [])
 
 
 @every

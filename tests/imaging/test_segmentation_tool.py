@@ -13,14 +13,14 @@ import pytest
 
 from imaging_objects import kidney_labels
 from tumortrack import api
+from tumortrack.case.options import PrepareOptions
+from tumortrack.case.segmentation_tool import segmented_case
 from tumortrack.core.errors import InputError
+from tumortrack.core.grid import voxel_ml
 from tumortrack.core.types import LabelVolume
-from tumortrack.imaging.case import Case
-from tumortrack.imaging.grid import voxel_ml
-from tumortrack.imaging.nifti import write_volume_nifti
-from tumortrack.imaging.options import PrepareOptions
-from tumortrack.imaging.segmentation_tool import segmented_case
-from tumortrack.imaging.volume import read_labels
+from tumortrack.io.case import Case
+from tumortrack.io.nifti import write_volume_nifti
+from tumortrack.io.volume import read_labels
 
 # Takes TotalSegmentator's own options, and writes a mask by HU for each class, as it does.
 THRESHOLDS = f"""#!{sys.executable}

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 from organ_objects import liver
+from tumortrack.case.options import PrepareOptions, parse_structures
+from tumortrack.case.prepare import prepare
+from tumortrack.case.structures import split_structures
 from tumortrack.core.errors import InputError
-from tumortrack.core.mesh_files import write_mesh
 from tumortrack.core.types import LabelVolume, Mesh
-from tumortrack.imaging.case import load_case, save_case
-from tumortrack.imaging.nifti import write_nifti
-from tumortrack.imaging.options import PrepareOptions, parse_structures
-from tumortrack.imaging.prepare import prepare
-from tumortrack.imaging.structures import split_structures
+from tumortrack.io.case import load_case, save_case
+from tumortrack.io.mesh_files import write_mesh
+from tumortrack.io.nifti import write_nifti
 
 VESSEL = 4
 

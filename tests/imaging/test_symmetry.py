@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from elastic_objects import organ
+from tumortrack.case.symmetry import AMBIGUOUS_MM, ambiguous, half_turns, warning
 from tumortrack.cli.main import run
 from tumortrack.core import store
-from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.types import Anatomy
-from tumortrack.imaging.symmetry import AMBIGUOUS_MM, ambiguous, half_turns, warning
+from tumortrack.io.mesh_files import write_anatomy
 from tumortrack_lab.world.kidneys import random_anatomy
 
 # Of the ellipsoid's tumor, 8 mm and 20 mm from the middle along two of its axes: half a turn about

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from live_objects import STAMP_NS, small_frame
+from tumortrack.core.camera import d405, deproject
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.values import Observation, PublishedFrame
 from tumortrack.live.views import FrameCheck
-from tumortrack.sense.camera import d405, deproject
-from tumortrack.sense.region import RegionConfig
-from tumortrack.sense.region.watch import TableWatch
+from tumortrack.segmentation import RegionConfig
+from tumortrack.segmentation.watch import TableWatch
 
 CAMERA = d405(424, 240)
 CONFIG = RegionConfig()

@@ -148,7 +148,7 @@ def test_the_examples_deformation_turns_one_end_against_the_other(example):
     from tumortrack_example.twist import TwistConfig
 
     from tumortrack.core.types import Anatomy
-    from tumortrack.simulate.deform.base import View
+    from tumortrack.simulation.deform.base import View
 
     view = View(Anatomy((small_box(),)), visible=lambda points: np.ones(len(points), bool))
     twist = TwistConfig(most_degrees=30).sample(view, np.random.default_rng(0))

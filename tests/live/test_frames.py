@@ -14,11 +14,11 @@ from clock import PATIENCE_S, Clock, until
 from live_objects import CAMERA, STAMP_NS, small_frame, small_setting
 from tumortrack.core.errors import InputError, NoEstimate, StorageError
 from tumortrack.core.types import DepthError, DepthFrame, Intrinsics
+from tumortrack.io.depth_files import DepthCorrection
 from tumortrack.live.loop import Loop, LoopConfig
 from tumortrack.live.values import Observation, PublishedFrame, SourceLost
 from tumortrack.live.views import FrameCheck
 from tumortrack.live.workers import OPENING_S, SourceWorker
-from tumortrack.sense.files import DepthCorrection
 
 HERE = PublishedFrame()
 

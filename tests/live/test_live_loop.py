@@ -15,8 +15,8 @@ from tumortrack.core.types import SensorCloud
 from tumortrack.live.loop import Loop, LoopConfig
 from tumortrack.live.values import Controls, PublishedFrame, SinkContext
 from tumortrack.live.workers import SourceWorker
-from tumortrack.sense.region import RegionConfig
-from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
+from tumortrack.segmentation import RegionConfig
+from tumortrack.simulation.scene import SceneRecipe, Simulator, body_for
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from warp_objects import ANATOMY, slim_clinic

@@ -24,7 +24,7 @@ from tumortrack.live.session import named_tools
 from tumortrack.live.tools import Tool, ToolConfig, Tools
 from tumortrack.live.values import CameraView, Observation
 from tumortrack.live.views import ViewsLocator
-from tumortrack.sense.region import RegionConfig
+from tumortrack.segmentation import RegionConfig
 from tumortrack.tracking.tracker import Follower
 
 SETTING = replace(small_setting(), anatomy_ct=small_anatomy())

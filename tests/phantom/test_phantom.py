@@ -11,7 +11,7 @@ from phantom_objects import FIRST, VOXEL, first_labels
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm
-from tumortrack.phantom.digital import (
+from tumortrack.simulation.phantom.digital import (
     PhantomParameters,
     TumorParameters,
     organ_field,

@@ -8,9 +8,9 @@ import pytest
 from phantom_objects import QUICK_SCAN, first_labels
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Volume
-from tumortrack.imaging.nifti import write_nifti, write_volume_nifti
-from tumortrack.phantom.dicom import write_dicom_series
-from tumortrack.phantom.scanner import scan
+from tumortrack.io.nifti import write_nifti, write_volume_nifti
+from tumortrack.simulation.phantom.dicom import write_dicom_series
+from tumortrack.simulation.phantom.scanner import scan
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from phantom_objects import FIRST, QUICK_SCAN, VOXEL, first_labels
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm
 from tumortrack.core.types import LabelVolume
-from tumortrack.phantom.scanner import ScannerParameters, scan
+from tumortrack.simulation.phantom.scanner import ScannerParameters, scan
 from volume_points import lps_of, read_at
 
 

@@ -10,22 +10,20 @@ import pytest
 
 from elastic_objects import CENTER, RADII
 from tumortrack.core.evidence import Landmark, Touch
+from tumortrack.organ.rest_shape import error_covariance_mm2
 from tumortrack.registration.bend import (
     BentFit,
-    _grouped,
     _Groups,
     _Linear,
     _Means,
-    _precision_of_forces,
     _with_compliance,
     bend,
 )
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.evidence import EvidenceTerms
 from tumortrack.registration.gauss_newton import GaussNewton, prior_precision, refine
-from tumortrack.registration.looks import Looks, Residuals
+from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import POSE
-from tumortrack.registration.rest_shape import error_covariance_mm2
 from warp_objects import ANATOMY, nudged, placed, refined
 
 CONFIG = GaussNewtonConfig()
@@ -102,20 +100,6 @@ def test_how_far_the_prior_holds_a_part_is_how_far_it_moves_without_some_of_it()
     ).held_by_prior_mm
     assert min(held_mm) > 0.1
     np.testing.assert_allclose(held_mm, np.linalg.norm(away_mm, axis=1) / less, rtol=0.4)
-
-
-def test_what_points_tell_is_as_they_say_and_what_they_do_not_is_wide():
-    known, seen_by, count = 3, np.diag([30.0, 10.0, 0.0]), 3
-    rows = np.concatenate([np.ones((3, known)), seen_by], axis=1)
-    near = Residuals(np.zeros(3), rows, np.zeros((3, 0)), np.ones(3))
-    precision = _precision_of_forces(near, known, 0.5)
-    variances = 1 / np.linalg.eigvalsh(precision)
-    assert precision.shape == (count, count)
-    np.testing.assert_allclose(np.sort(variances), np.sort([
-        (900 * 0.25 + 4) / 901, (100 * 0.25 + 4) / 101, 4.0
-    ]))  # fmt: skip
-    strong = _precision_of_forces(near, known, 6.0)
-    np.testing.assert_allclose(np.linalg.inv(strong), 36 * np.eye(3), atol=1e-9)
 
 
 def test_an_organ_near_the_mean_has_a_narrow_prior_and_one_far_off_a_wide_one():
@@ -202,15 +186,3 @@ def test_what_neighbours_and_tools_share_is_as_if_it_were_unknown():
     np.testing.assert_allclose(
         np.linalg.solve(at.curvature, at.gradient), step, rtol=1e-4, atol=1e-7
     )
-
-
-def test_groups_are_those_of_the_nearest_of_points_that_lie_far_apart():
-    points = np.random.default_rng(3).uniform(0, 50, (400, 3))
-    chosen = [int(np.linalg.norm(points - points.mean(0), axis=1).argmax())]
-    for _ in range(63):
-        nearest = np.linalg.norm(points[:, None] - points[chosen], axis=2).min(1)
-        chosen.append(int(nearest.argmax()))
-    expected = np.linalg.norm(points[:, None] - points[chosen], axis=2).argmin(1)
-    np.testing.assert_array_equal(_grouped(points), expected)
-    twice = np.array([[0.0, 0, 0], [9, 0, 0], [0, 0, 0], [9, 0, 0]])
-    np.testing.assert_array_equal(np.unique(_grouped(twice)), [0, 1])  # none is empty

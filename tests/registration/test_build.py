@@ -14,10 +14,10 @@ from elastic_objects import SMALL, UP
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.types import SensorCloud
-from tumortrack.imaging.case import Case, load_case, save_case
+from tumortrack.io.case import Case, load_case, save_case
 from tumortrack.registration.config import clinic
 from tumortrack.registration.model import build_model
-from tumortrack.simulate.deform import DragConfig, ElasticConfig
+from tumortrack.simulation.deform import DragConfig, ElasticConfig
 from tumortrack.tracking import model_files
 from tumortrack.tracking.model_files import case_model, load_model, make_model
 from tumortrack.tracking.tracker import Tracker

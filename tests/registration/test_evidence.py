@@ -26,9 +26,9 @@ from tumortrack.core.evidence import (
     read_evidence,
 )
 from tumortrack.core.types import Mesh, SensorCloud
+from tumortrack.io.ply import write_cloud_ply
 from tumortrack.registration.evidence import EvidenceTerms, Known, still_known
 from tumortrack.registration.looks import Looks
-from tumortrack.sense.ply import write_cloud_ply
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from warp_objects import ANATOMY, method, nudged, placed, shape
@@ -133,12 +133,9 @@ def test_a_closed_structure_is_touched_and_outlined_as_a_part_is():
     told = Outline(places_mm=tuple(map(at, artery.vertices_mm[::40])), part="artery", std_mm=0.5)
     terms = EvidenceTerms.of([told], tuple(anatomy.closed))
     assert np.abs(terms.at(true).residuals_mm).max() < 0.3
-    registration, off = replace(method(), rest=rest), {}
-    for name, evidence in {"nothing": None, "artery": terms}.items():
-        motion = registration.register(Looks.of([SEEN], (), evidence)).motion
-        off_mm = motion.carry(artery.vertices_mm) - true.carry(artery.vertices_mm)
-        off[name] = np.linalg.norm(off_mm, axis=1).mean()
-    assert off["artery"] < 0.7 * off["nothing"]
+    fit = replace(method(), rest=rest).register(Looks.of([SEEN], (), terms))
+    off_mm = fit.motion.carry(artery.vertices_mm) - true.carry(artery.vertices_mm)
+    assert np.linalg.norm(off_mm, axis=1).mean() < 2
     with pytest.raises(InputError, match="sheet"):
         EvidenceTerms.of([Touch(place_mm=at(CENTER), part="sheet")], tuple(anatomy.closed))
 

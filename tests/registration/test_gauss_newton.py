@@ -15,12 +15,12 @@ from reports import looked
 from tumortrack.core.estimate import FollowOptions
 from tumortrack.core.process import parallel_for, parallel_map
 from tumortrack.core.types import SensorCloud
+from tumortrack.organ.flow import BLOCK, steps_for
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.estimate import look_up, nearest_lookup
 from tumortrack.registration.gauss_newton import prior_precision
 from tumortrack.registration.locator import RegistrationLocator
 from tumortrack.registration.motion import ElasticMotion
-from tumortrack.simulate.elastic.flow import BLOCK, steps_for
 from tumortrack.tracking.model_files import load_model
 from warp_objects import (
     ANATOMY,

@@ -13,10 +13,13 @@ from scipy.spatial.transform import Rotation
 from live_objects import small_setting
 from stories import answered, refusal, tumortrack
 from tumortrack.core import store
+from tumortrack.core.camera import d405, deproject
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.render import render_depth
 from tumortrack.core.report import Cause
 from tumortrack.core.types import DepthFrame, Look, SensorCloud
+from tumortrack.io.depth_files import depth_png, intrinsics_json, read_poses
 from tumortrack.live.values import CameraView, Observation
 from tumortrack.live.views import Scan, ViewsLocator
 from tumortrack.registration import bend as bend_module
@@ -27,10 +30,7 @@ from tumortrack.registration.gauss_newton import refine
 from tumortrack.registration.looks import CAMERA_STD, Looks
 from tumortrack.registration.motion import seen_from_first
 from tumortrack.registration.search import PosePrior, Search
-from tumortrack.sense.camera import d405, deproject
-from tumortrack.sense.files import depth_png, intrinsics_json, read_poses
-from tumortrack.sense.region import RegionConfig
-from tumortrack.sense.render import render_depth
+from tumortrack.segmentation import RegionConfig
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from warp_objects import ANATOMY, PLACE_MM, nudged, placed, shape
@@ -216,12 +216,10 @@ def test_bad_poses_are_refused(tmp_path, changed, named):
     assert "poses.json" in str(refused.value)
 
 
-def test_metres_are_millimetres(tmp_path):
-    poses = np.array(poses_json()["fixed_from_camera"])
+def test_poses_in_metres_become_millimetres(tmp_path):
+    poses = np.array([around(degrees) for degrees in (0, 60)])
     poses[:, :3, 3] /= 1000
-    (tmp_path / "poses.json").write_text(
-        json.dumps(poses_json(fixed_from_camera=poses.tolist(), unit="m"))
-    )
+    (tmp_path / "poses.json").write_text(json.dumps(poses_json(**of_poses(*poses), unit="m")))
     frame_id, (_, second) = read_poses(tmp_path / "poses.json", 2)
     assert frame_id == "base_link"
     np.testing.assert_allclose(second, around(60), atol=1e-9)

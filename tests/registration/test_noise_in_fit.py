@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tumortrack.core.camera import d405, deproject
+from tumortrack.core.render import render_depth
 from tumortrack.core.report import SizeFit
 from tumortrack.core.types import DepthError, PointNoise
-from tumortrack.models.in_distribution import RIVAL_COST
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import RegistrationResult, refine
+from tumortrack.registration.in_distribution import RIVAL_COST
 from tumortrack.registration.looks import Looks, depth_share, kernel_width_mm, lies_on
 from tumortrack.registration.registration import likeliest
-from tumortrack.sense.camera import d405, deproject
-from tumortrack.sense.render import render_depth
 from warp_objects import ANATOMY, method, placed, shape
 
 CONFIG, ORGAN, MOTION = GaussNewtonConfig(), ANATOMY.organ, placed()

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from itertools import pairwise
 
-import msgspec
 import numpy as np
 import pytest
 import trimesh
@@ -16,11 +14,11 @@ from elastic_objects import CENTER, RADII, SMALL
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Motion
 from tumortrack.core.types import Mesh
+from tumortrack.organ.rest_shape import RestShape, distance_of
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import prior_precision
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
-from tumortrack.registration.rest_shape import RestShape, distance_of
 from tumortrack.registration.search import turned_starts
 from warp_objects import (
     ANATOMY,
@@ -125,14 +123,6 @@ def test_what_is_no_list_of_finite_points_is_refused(way, unchecked):
         ask(points)
 
 
-def test_a_librarys_states_have_a_rarity_of_one_on_average():
-    rarities = [placed(state).rarity for state in range(len(shape().body.states))]
-    assert np.mean(rarities) == pytest.approx(1, abs=0.03)
-    assert max(rarities) > 2
-    mean = dataclasses.replace(placed(), coefficients=shape().body.mean)
-    assert mean.rarity == 0
-
-
 # --- refinement ---
 
 
@@ -220,19 +210,11 @@ def test_a_wrong_scale_of_the_camera_shows_in_the_fit(times):
     assert size.gain == pytest.approx(((size.times - 1) / size.std) ** 2)
 
 
-def test_every_step_lowers_the_cost_and_enough_steps_end():
+def test_the_best_of_several_starts_wins_wherever_it_stands():
     points = surface(placed(), 500)
     steady = GaussNewtonConfig(steps=40, first_mm=3.0, last_mm=3.0)
-    fits = [
-        refined(points, START, msgspec.structs.replace(steady, steps=n)) for n in (0, 1, 2, 4, 40)
-    ]
-    costs = [fit.cost for fit in fits]
-    assert all(after < before for before, after in pairwise(costs[:4]))
-    assert costs[4] <= costs[3] * 1.001
-    assert costs[4] < 0.1 * costs[0]
-    assert fits[4].steps < 40
     alone, far = refined(points, START, steady), nudged(placed(), [0, 0, 60], [0, 0, 0])
-    for starts in ([START, far], [far, START]):  # the best wins wherever it stands
+    for starts in ([START, far], [far, START]):
         best = method(steady).best_fit(Looks.of([points]), starts)
         # A little less where a start beside it ends nearer to the minimum.
         assert 0.97 * alone.cost < best.cost <= alone.cost

@@ -17,10 +17,10 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Motion
 from tumortrack.core.mesh_query import labels_of, surface_distance
 from tumortrack.core.types import Anatomy, SensorCloud
-from tumortrack.models.folder import save_model
-from tumortrack.sense.ply import write_cloud_ply
-from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
-from tumortrack.simulate.scene_folder import draw_targets
+from tumortrack.io.model_folder import save_model
+from tumortrack.io.ply import write_cloud_ply
+from tumortrack.io.scene_folder import draw_targets
+from tumortrack.simulation.scene import SceneRecipe, Simulator, body_for
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from warp_objects import ANATOMY, shape, slim_clinic

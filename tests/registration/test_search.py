@@ -14,9 +14,9 @@ from pose_objects import OVER, PLACE_MM, lying, seen
 from tumortrack.core.estimate import FollowOptions
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import Anatomy, SensorCloud
-from tumortrack.imaging.case import load_case
-from tumortrack.models.in_distribution import RIVAL_COST
+from tumortrack.io.case import load_case
 from tumortrack.registration.config import GaussNewtonConfig
+from tumortrack.registration.in_distribution import RIVAL_COST
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.search import APART_MM, PosePrior, Search, apart_mm

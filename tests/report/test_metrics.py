@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from covering import cover
 from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_query import surface_samples
+from tumortrack.core.raster import voxelise
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
-from tumortrack.imaging.raster import voxelise
 from tumortrack.report.metrics import (
     box_center_distance,
     distance_to_surface,

@@ -19,8 +19,8 @@ from tumortrack.report.pictures import (
     write_sheet,
 )
 from tumortrack.report.renderer import Body, Frame, ParallelView
+from tumortrack.report.slices import ORIENTATIONS, SlicePlane
 from tumortrack.report.wrapping import wrapped
-from tumortrack.tracking.slices import ORIENTATIONS, SlicePlane
 
 FROM_CAMERA, FROM_SIDE = (ParallelView(way, *ORIENTATIONS[way]) for way in list(ORIENTATIONS)[:2])
 CORONAL, SAGITTAL = (ParallelView(way, *PLANES[way]) for way in ("coronal", "sagittal"))

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
+from tumortrack.io.scene_folder import Scene, Targets
 from tumortrack.report.rivals import Rivals, best_rigid_pose, rigid_fit, rivals_of
-from tumortrack.simulate.scene_folder import Scene, Targets
 from tumortrack.tracking.model_files import load_model
 
 TURN = Rotation.from_euler("xyz", [35, -50, 110], degrees=True).as_matrix()

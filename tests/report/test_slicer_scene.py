@@ -16,18 +16,18 @@ import clients
 from imaging_objects import kidney_labels
 from live_objects import small_estimate
 from reports import NOWHERE, bounded, reporting
+from tumortrack.case.prepare import prepare
+from tumortrack.case.surface import surfaces
 from tumortrack.cli.cases import Export
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, rigid, transform_points
-from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import CameraLabels, Volume
-from tumortrack.imaging.case import Case, load_case, save_case
-from tumortrack.imaging.prepare import prepare
-from tumortrack.imaging.surface import surfaces
-from tumortrack.tracking.files import write_estimate
-from tumortrack.tracking.points import PointTable, read_points
+from tumortrack.io.case import Case, load_case, save_case
+from tumortrack.io.mesh_files import read_mesh
+from tumortrack.io.points import PointTable, read_points
+from tumortrack.io.run_folder import write_estimate
 
 CAMERA_FROM_CT = rigid(Rotation.from_euler("x", 60, degrees=True).as_matrix(), np.arange(3) * 40.0)
 RAS = np.array([-1.0, -1, 1])  # of LPS, and back

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from noise_objects import noisy, seen
+from tumortrack.core.camera import deproject
 from tumortrack.core.types import SensorCloud
-from tumortrack.sense.camera import deproject
-from tumortrack.sense.measured_noise import cloud_noise, depth_step_mm, image_noise
+from tumortrack.segmentation.measured_noise import cloud_noise, depth_step_mm, image_noise
 
 
 @pytest.mark.parametrize(("width", "distance_mm"), [(848, 150), (848, 300), (424, 150), (640, 400)])

@@ -8,18 +8,13 @@ import pytest
 from depth_objects import SMALL, dome, wall
 from render_objects import anatomy
 from tumortrack.core.config import from_builtins, to_builtins
+from tumortrack.core.depth_kernels import seen_pixels
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
-from tumortrack.sense.clutter import ClutterConfig
-from tumortrack.sense.kernels import seen_pixels
-from tumortrack.sense.noise import D405_NOISE, CalibrationConfig, miscalibrate
-from tumortrack.sense.occlusion import (
-    OcclusionConfig,
-    occlude,
-    order_shaft,
-    take_first,
-)
-from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
+from tumortrack.simulation.clutter import ClutterConfig
+from tumortrack.simulation.noise import D405_NOISE, CalibrationConfig, miscalibrate
+from tumortrack.simulation.occlusion import OcclusionConfig, occlude, order_shaft, take_first
+from tumortrack.simulation.scene import SceneConfig, SceneRecipe, Simulator
 
 HIDING = OcclusionConfig(scenes=1.0, largest_share=0.6)
 ANATOMY = anatomy(3)

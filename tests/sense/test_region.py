@@ -16,12 +16,12 @@ from region_objects import (
     make_scene,
     precision_recall,
 )
+from tumortrack.core.camera import d405, deproject, deproject_pixels, project
+from tumortrack.core.cloud import CloudConfig
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.sense.camera import d405, deproject, deproject_pixels, project
-from tumortrack.sense.cloud import CloudConfig
-from tumortrack.sense.region import Hints, RegionConfig, organ_points
-from tumortrack.sense.units import Unit
+from tumortrack.core.units import Unit
+from tumortrack.segmentation import Hints, RegionConfig, organ_points
 from tumortrack_lab.world.kidneys import random_anatomy
 
 WIDE = CloudConfig(near_mm=60.0, far_mm=400.0)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from render_objects import bumpy, ray_hits, sphere
+from tumortrack.core.camera import d405, deproject
+from tumortrack.core.render import Visibility, render_depth
 from tumortrack.core.types import Intrinsics, Mesh
-from tumortrack.sense.camera import d405, deproject
-from tumortrack.sense.render import Visibility, render_depth
 
 CAMERA = Intrinsics(211, 121, 110.0, 113.0, 105.0, 60.0)
 

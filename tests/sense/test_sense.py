@@ -6,19 +6,13 @@ import numpy as np
 import pytest
 
 from depth_objects import SMALL, dome, pixels, wall
+from tumortrack.core.camera import d405, deproject, project
+from tumortrack.core.cloud import CloudConfig, check_cloud, cloud_from_depth, crop_cloud, thin_cloud
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
-from tumortrack.sense.camera import d405, deproject, project
-from tumortrack.sense.cloud import (
-    CloudConfig,
-    check_cloud,
-    cloud_from_depth,
-    crop_cloud,
-    thin_cloud,
-)
-from tumortrack.sense.clutter import ClutterConfig, add_clutter
-from tumortrack.sense.noise import CLEAN, D405_NOISE, NoiseConfig, add_noise
-from tumortrack.sense.units import Unit, likely_unit
+from tumortrack.core.units import Unit, likely_unit
+from tumortrack.simulation.clutter import ClutterConfig, add_clutter
+from tumortrack.simulation.noise import CLEAN, D405_NOISE, NoiseConfig, add_noise
 
 
 def rows(points):

@@ -13,19 +13,19 @@ from PIL import Image
 
 from depth_files import write_depth_png, write_intrinsics
 from depth_objects import SMALL, dome, pixels, wall
+from tumortrack.core.camera import d405, deproject
+from tumortrack.core.cloud import check_cloud
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthError, Intrinsics
-from tumortrack.sense.camera import d405, deproject
-from tumortrack.sense.cloud import check_cloud
-from tumortrack.sense.files import (
+from tumortrack.io.depth_files import (
     CALIBRATED_MM,
     intrinsics_json,
     read_cloud,
     read_depth_png,
     read_intrinsics,
 )
-from tumortrack.sense.noise import NoiseConfig, add_noise
-from tumortrack.sense.ply import write_cloud_ply
+from tumortrack.io.ply import write_cloud_ply
+from tumortrack.simulation.noise import NoiseConfig, add_noise
 
 
 @pytest.fixture

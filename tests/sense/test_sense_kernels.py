@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
+from tumortrack.core import depth_kernels as kernels
+from tumortrack.core.camera import Pinhole
 from tumortrack.core.types import SensorCloud
-from tumortrack.sense import kernels
-from tumortrack.sense.camera import Pinhole
-from tumortrack.sense.region import choose, pieces, plane, working_image
-from tumortrack.sense.region.working_image import LAST_BOX, RANGE, WorkingImage
-from tumortrack.sense.smoothing import _smooth_depth
+from tumortrack.segmentation import choose, pieces, plane, working_image
+from tumortrack.segmentation.smoothing import _smooth_depth
+from tumortrack.segmentation.working_image import LAST_BOX, RANGE, WorkingImage
 
 CAMERA = Pinhole(50.0, 52.0, 14.3, 9.8)
 JUMP = 0.01, 1e-5

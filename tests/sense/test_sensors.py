@@ -12,10 +12,10 @@ from noise_objects import seen
 from stories import succeeded, tumortrack
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, Intrinsics
-from tumortrack.sense.measured_noise import depth_step_mm
-from tumortrack.sense.noise import D405_NOISE, STEREO_NOISE, add_noise
-from tumortrack.sense.sensors import FIGURES, depth_error_of, simulated
-from tumortrack.simulate.scene_folder import read_scene
+from tumortrack.io.scene_folder import read_scene
+from tumortrack.segmentation.measured_noise import depth_step_mm
+from tumortrack.simulation.noise import D405_NOISE, STEREO_NOISE, add_noise
+from tumortrack.simulation.sensors import FIGURES, depth_error_of, simulated
 from tumortrack.tracking.options import LocateOptions, SimulatedSensor, SimulateOptions
 
 FLIGHT = [name for name in FIGURES if "flying_share" in FIGURES[name]]

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from noise_objects import noisy, seen
+from tumortrack.core.camera import deproject
 from tumortrack.core.types import SensorCloud
-from tumortrack.sense.camera import deproject
-from tumortrack.sense.measured_noise import image_noise
-from tumortrack.sense.smoothing import clean_cloud, smoothed, window_px
+from tumortrack.segmentation.measured_noise import image_noise
+from tumortrack.segmentation.smoothing import clean_cloud, smoothed, window_px
 
 EVERY = slice(None), slice(None)
 

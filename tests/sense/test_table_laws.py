@@ -15,15 +15,15 @@ from PIL import Image
 
 from depth_files import write_intrinsics
 from tumortrack.core.errors import InputError
-from tumortrack.core.evidence_files import read_evidence
 from tumortrack.core.store import natural, read_json
 from tumortrack.core.types import Intrinsics
+from tumortrack.io.depth_files import read_camera, read_cloud, read_depth, read_poses
+from tumortrack.io.evidence_files import read_evidence
+from tumortrack.io.ply import cloud_ply
+from tumortrack.io.points import read_points
+from tumortrack.io.scene_folder import list_scenes
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.poses import FilePoses
-from tumortrack.sense.files import read_camera, read_cloud, read_depth, read_poses
-from tumortrack.sense.ply import cloud_ply
-from tumortrack.simulate.scene_folder import list_scenes
-from tumortrack.tracking.points import read_points
 
 QUOTED = '","'
 STAMP_NS = 1_700_000_000_123_456_789

@@ -13,12 +13,12 @@ import tumortrack as tt
 from colour_objects import clicks_on, painted, random_colours, random_light
 from depth_objects import SMALL, dome, pixels
 from region_objects import DRAPED, FAT, ORGAN, make_scene, precision_recall
+from tumortrack.core.camera import deproject
+from tumortrack.core.cloud import CloudConfig
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.sense.camera import deproject
-from tumortrack.sense.cloud import CloudConfig
-from tumortrack.sense.region import Hints, RegionConfig, organ_points
-from tumortrack.sense.region.tissue import sample_click, teach
+from tumortrack.segmentation import Hints, RegionConfig, organ_points
+from tumortrack.segmentation.tissue import sample_click, teach
 from tumortrack_lab.world.kidneys import random_anatomy
 
 CONFIG = RegionConfig(crop=CloudConfig(near_mm=60.0, far_mm=400.0))

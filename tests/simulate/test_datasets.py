@@ -12,10 +12,10 @@ from scipy.spatial import cKDTree
 import tumortrack as tt
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.render import render_depth
 from tumortrack.core.rigid_fit import fit_over_volume, matched_vertices
-from tumortrack.sense.render import render_depth
-from tumortrack.simulate.datasets import FILE
-from tumortrack.simulate.scene_folder import Scene, read_scene
+from tumortrack.io.scene_folder import Scene, read_scene
+from tumortrack.simulation.datasets import FILE
 
 MOST_BYTES = 5_000_000
 KEPT_MM = 0.00052  # half a step of the kept places, and rounding
@@ -32,7 +32,7 @@ def scenes() -> dict[str, Scene]:
 def test_there_are_ten_in_at_most_5_mb():
     assert len(scenes()) == tt.datasets.SCENES == 10
     assert all(scene.meta["words"] for scene in scenes().values())
-    file = resources.files("tumortrack.simulate").joinpath(FILE)
+    file = resources.files("tumortrack.simulation").joinpath(FILE)
     assert len(file.read_bytes()) <= MOST_BYTES
 
 

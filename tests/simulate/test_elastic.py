@@ -12,16 +12,9 @@ from elastic_objects import CENTER, RADII, SMALL, UP, organ
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.simulate.deform import ChainConfig, DragConfig, ElasticConfig, StretchConfig
-from tumortrack.simulate.deform.base import View
-from tumortrack.simulate.elastic.body import ElasticBody, build_body
-from tumortrack.simulate.elastic.finite import (
-    CORNERS,
-    ElementLattice,
-    LatticeSolid,
-    cube_stiffness,
-)
-from tumortrack.simulate.elastic.loads import (
+from tumortrack.organ.body import ElasticBody, build_body
+from tumortrack.organ.finite import CORNERS, ElementLattice, LatticeSolid, cube_stiffness
+from tumortrack.organ.loads import (
     KPA,
     LOADS,
     ReducedProblem,
@@ -30,18 +23,16 @@ from tumortrack.simulate.elastic.loads import (
     random_states,
     state_of,
 )
-from tumortrack.simulate.elastic.modes import (
+from tumortrack.organ.modes import (
     ReducedModel,
     compliance_modes,
     modes_of,
     patches_of,
     random_loads,
 )
-from tumortrack.simulate.scene import (
-    PoseConfig,
-    SceneConfig,
-    body_for,
-)
+from tumortrack.simulation.deform import ChainConfig, DragConfig, ElasticConfig, StretchConfig
+from tumortrack.simulation.deform.base import View
+from tumortrack.simulation.scene import PoseConfig, SceneConfig, body_for
 
 ANATOMY = organ()
 ORGAN = ANATOMY.organ

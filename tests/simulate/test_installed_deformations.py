@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from tumortrack.core.config import Config
-from tumortrack.simulate.deform.base import View
-from tumortrack.simulate.scene import SceneConfig  # the configuration that will hold it
+from tumortrack.simulation.deform.base import View
+from tumortrack.simulation.scene import SceneConfig  # the configuration that will hold it
 
 
 @dataclass(frozen=True)
@@ -51,11 +51,11 @@ USE = """
 import sys
 import json, pickle
 import numpy as np
-import tumortrack.simulate.deform
+import tumortrack.simulation.deform
 assert "shifting" not in sys.modules  # imported when a configuration is read
 from render_objects import anatomy
 from tumortrack.core.config import from_builtins, to_builtins
-from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator, body_for
+from tumortrack.simulation.scene import SceneConfig, SceneRecipe, Simulator, body_for
 
 text = '''{"deform": [{"type": "shift", "most_mm": 9}, {"type": "chain", "links":
     [{"type": "drag"}, {"type": "shift"}]}], "occupancy": {"per_side": 16, "pool": 2000}}'''
@@ -80,7 +80,7 @@ print("used")
 
 READ = """
 from tumortrack.core.config import from_builtins
-from tumortrack.simulate.scene import SceneConfig
+from tumortrack.simulation.scene import SceneConfig
 read = [{"type": "drag"}, {"type": "chain", "links": [{"type": "stretch"}]}]
 from_builtins({"deform": read}, SceneConfig, "scene.json")
 print("read")

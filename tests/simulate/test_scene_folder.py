@@ -7,9 +7,9 @@ import pytest
 import trimesh
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.mesh_files import write_mesh
 from tumortrack.core.types import Anatomy, DepthFrame, Intrinsics, Mesh, SensorCloud
-from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
+from tumortrack.io.mesh_files import write_mesh
+from tumortrack.io.scene_folder import Scene, list_scenes, read_scene
 
 
 def ball(radius_mm, center_mm):

@@ -5,18 +5,13 @@ import numpy as np
 import pytest
 
 from render_objects import anatomy, ray_hits
+from tumortrack.core.camera import deproject
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import InputError
-from tumortrack.sense.camera import deproject
-from tumortrack.sense.clutter import ClutterConfig
-from tumortrack.sense.noise import D405_NOISE
-from tumortrack.simulate.deform import DragConfig, StretchConfig
-from tumortrack.simulate.scene import (
-    STREAMS,
-    SceneConfig,
-    SceneRecipe,
-    Simulator,
-)
+from tumortrack.simulation.clutter import ClutterConfig
+from tumortrack.simulation.deform import DragConfig, StretchConfig
+from tumortrack.simulation.noise import D405_NOISE
+from tumortrack.simulation.scene import STREAMS, SceneConfig, SceneRecipe, Simulator
 
 ANATOMY = anatomy()
 UP = (0.0, -1.0, 0.0)

@@ -10,9 +10,9 @@ from scipy.stats import kstest
 
 from render_objects import anatomy, sphere
 from tumortrack.core.geometry import direction_lps, transform_points
-from tumortrack.simulate.deform.base import View
-from tumortrack.simulate.deform.drag import CONFIGURATIONS, DragConfig, Drags, _centres
-from tumortrack.simulate.scene import PoseConfig, sample_pose
+from tumortrack.simulation.deform.base import View
+from tumortrack.simulation.deform.drag import CONFIGURATIONS, DragConfig, Drags, _centres
+from tumortrack.simulation.scene import PoseConfig, sample_pose
 
 ANATOMY = anatomy()
 ORGAN = ANATOMY.organ

@@ -7,9 +7,9 @@ import pytest
 import trimesh
 
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.simulate.deform import ChainConfig, DragConfig, StretchConfig
-from tumortrack.simulate.deform.base import View
-from tumortrack.simulate.deform.stretch import Stretch
+from tumortrack.simulation.deform import ChainConfig, DragConfig, StretchConfig
+from tumortrack.simulation.deform.base import View
+from tumortrack.simulation.deform.stretch import Stretch
 
 
 @pytest.fixture(scope="module")

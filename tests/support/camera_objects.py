@@ -19,7 +19,7 @@ from tumortrack.live.loop import Loop, LoopConfig, summary
 from tumortrack.live.poses import CameraPoses
 from tumortrack.live.values import Observation, PublishedFrame, SinkContext, SourceEnded
 from tumortrack.live.workers import SinkWorker, SourceWorker
-from tumortrack.sense.region import RegionConfig
+from tumortrack.segmentation import RegionConfig
 from tumortrack.tracking.tracker import Tracker
 
 MS = 1_000_000

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tumortrack.core.store import write_json
 from tumortrack.core.types import DepthFrame, Intrinsics
-from tumortrack.sense.files import DEPTH_UNIT_MM, depth_png, intrinsics_json
+from tumortrack.io.depth_files import DEPTH_UNIT_MM, depth_png, intrinsics_json
 
 
 def write_depth_png(path: Path, frame: DepthFrame) -> None:

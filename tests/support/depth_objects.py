@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from tumortrack.core.camera import d405
 from tumortrack.core.types import DepthFrame, Intrinsics
-from tumortrack.sense.camera import d405
 
 SMALL = d405(424, 240)
 

@@ -6,7 +6,7 @@ import numpy as np
 import trimesh
 
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.simulate.elastic.body import BodyConfig
+from tumortrack.organ.body import BodyConfig
 
 UP = (0.0, -1.0, 0.0)
 CENTER = np.array([60.0, -20.0, -900.0])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from tumortrack.core.types import LabelVolume
-from tumortrack.phantom.digital import PhantomParameters, phantom_labels
-from tumortrack.phantom.scanner import ScannerParameters
+from tumortrack.simulation.phantom.digital import PhantomParameters, phantom_labels
+from tumortrack.simulation.phantom.scanner import ScannerParameters
 
 VOXEL = 1.0
 FIRST = PhantomParameters()

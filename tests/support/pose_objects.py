@@ -6,11 +6,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from elastic_objects import UP
+from tumortrack.core.camera import d405
 from tumortrack.core.geometry import Affine, rotation_onto, transform_points
+from tumortrack.core.render import render_depth
+from tumortrack.organ.rest_shape import RestShape
 from tumortrack.registration.motion import ElasticMotion
-from tumortrack.registration.rest_shape import RestShape
-from tumortrack.sense.camera import d405
-from tumortrack.sense.render import render_depth
 
 CAMERA = d405(212, 120)
 PLACE_MM = np.array([6.0, -4.0, 160.0])

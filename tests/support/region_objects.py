@@ -10,11 +10,11 @@ import trimesh
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from tumortrack.core.camera import d405
 from tumortrack.core.geometry import rigid, rotation_onto, transform_points
+from tumortrack.core.render import render_depth
 from tumortrack.core.types import DepthFrame, Intrinsics, Mesh
-from tumortrack.sense.camera import d405
-from tumortrack.sense.noise import D405_NOISE, NoiseConfig, add_noise
-from tumortrack.sense.render import render_depth
+from tumortrack.simulation.noise import D405_NOISE, NoiseConfig, add_noise
 
 BASELINE_MM = 18.0  # of a D405
 BACKGROUND, ORGAN, SHAFT, HAND, FAT = range(5)

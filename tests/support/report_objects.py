@@ -8,8 +8,8 @@ import trimesh
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.report import FitReport
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud, SensorCloud
+from tumortrack.io.scene_folder import Scene
 from tumortrack.report.metrics import label_grid
-from tumortrack.simulate.scene_folder import Scene
 
 
 def ball(radius_mm, center_mm=(0.0, 0.0, 0.0), subdivisions=3):

@@ -13,10 +13,10 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
+from tumortrack.core.camera import deproject_pixels
 from tumortrack.core.geometry import rigid, rotation_onto, transform_points
+from tumortrack.core.render import render_depth
 from tumortrack.core.types import DepthFrame, Intrinsics, Mesh
-from tumortrack.sense.camera import deproject_pixels
-from tumortrack.sense.render import render_depth
 from tumortrack_devices.stereo import StereoCalibration
 
 _GRID_MM, _SIDE = 1.2, 96  # of the texture, which repeats

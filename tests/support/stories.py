@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 
 import warm
+from tumortrack.case.surface import surfaces
 from tumortrack.core import store
 from tumortrack.core.patient import Patient
-from tumortrack.imaging.case import Case, load_case, save_case
-from tumortrack.imaging.surface import surfaces
-from tumortrack.models.folder import save_model
-from tumortrack.phantom.digital import PhantomParameters, phantom_labels
+from tumortrack.io.case import Case, load_case, save_case
+from tumortrack.io.model_folder import save_model
+from tumortrack.simulation.phantom.digital import PhantomParameters, phantom_labels
 from tumortrack.tracking.model_files import make_model
 
 COMMAND = [sys.executable, "-m", "tumortrack.cli.main"]

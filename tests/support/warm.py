@@ -29,9 +29,9 @@ PRELOADED = (
     "tumortrack.tracking.presets",
     "tumortrack.registration.model",
     "tumortrack.report.protocol",
-    "tumortrack.imaging.case",
+    "tumortrack.io.case",
     "tumortrack_occupancy.training.train",
-    "tumortrack.simulate.scene",
+    "tumortrack.simulation.scene",
     "tumortrack.tracking.tracker",
 )
 

@@ -11,18 +11,18 @@ from scipy.spatial.transform import Rotation
 
 from elastic_objects import SMALL, UP, organ
 from tumortrack.core.types import Anatomy
-from tumortrack.models.folder import save_model
+from tumortrack.io.model_folder import save_model
+from tumortrack.organ.body import build_body
+from tumortrack.organ.rest_shape import DistanceField, RestShape, distances_of
 from tumortrack.registration.config import GaussNewtonConfig, RegistrationConfig
 from tumortrack.registration.gauss_newton import GaussNewton, RegistrationResult, refine
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import build_model
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.registration import Registration
-from tumortrack.registration.rest_shape import DistanceField, RestShape, distances_of
 from tumortrack.registration.search import PosePrior
-from tumortrack.simulate.deform import ElasticConfig
-from tumortrack.simulate.elastic.body import build_body
-from tumortrack.simulate.scene import SceneConfig
+from tumortrack.simulation.deform import ElasticConfig
+from tumortrack.simulation.scene import SceneConfig
 
 ANATOMY: Anatomy = organ()
 TURNED = Rotation.from_euler("xyz", [95, 10, 35], degrees=True).as_matrix()

@@ -11,14 +11,14 @@ import tumortrack as tt
 from extension_objects import distribution
 from tumortrack.cli.doctor import Doctor
 from tumortrack.core.errors import InputError, PackageError, TumortrackError
-from tumortrack.models.method import method_of_config, method_of_preset
-from tumortrack.models.model import ModelConfig
-from tumortrack.simulate.scene import SceneConfig
+from tumortrack.registration.base_model import ModelConfig
+from tumortrack.registration.method import method_of_config, method_of_preset
+from tumortrack.simulation.scene import SceneConfig
 
 METHOD = """
 from dataclasses import replace
-from tumortrack.models.model import ModelConfig
-from tumortrack.simulate.scene import SceneConfig
+from tumortrack.registration.base_model import ModelConfig
+from tumortrack.simulation.scene import SceneConfig
 
 class GuessConfig(ModelConfig, frozen=True):
     scene: SceneConfig = SceneConfig()

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tumortrack.core.camera import d405, deproject
 from tumortrack.core.errors import NotThisOrgan
+from tumortrack.core.render import render_depth
 from tumortrack.core.types import Look, SensorCloud
-from tumortrack.sense.camera import d405, deproject
-from tumortrack.sense.region import Hints
-from tumortrack.sense.render import render_depth
+from tumortrack.segmentation import Hints
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.options import LocateOptions
 from tumortrack.tracking.pieces import likeliest_piece

@@ -21,10 +21,10 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud
-from tumortrack.sense.files import read_cloud
-from tumortrack.sense.ply import write_cloud_ply
-from tumortrack.tracking.files import write_estimate
-from tumortrack.tracking.points import camera_table, check_near_organ, read_points
+from tumortrack.io.depth_files import read_cloud
+from tumortrack.io.ply import write_cloud_ply
+from tumortrack.io.points import camera_table, check_near_organ, read_points
+from tumortrack.io.run_folder import write_estimate
 
 MIDDLE = np.array([60.0, 40.0, -300.0])
 BOX = np.stack([MIDDLE - 30, MIDDLE + 30])

@@ -22,18 +22,18 @@ from imaging_objects import (
     write_dicom,
 )
 from live_objects import small_estimate
+from tumortrack.case.meshes import read_meshes
+from tumortrack.case.surface import surfaces
 from tumortrack.core.errors import InputError
-from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.packages import to_install
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import CameraLabels, LabelVolume, Mesh, Volume
-from tumortrack.imaging.case import Case, save_case
-from tumortrack.imaging.meshes import read_meshes
-from tumortrack.imaging.segmentation_files import segments, write_dicom_seg, write_seg_nrrd
-from tumortrack.imaging.surface import surfaces
-from tumortrack.imaging.volume import read_labels
-from tumortrack.phantom.dicom import write_dicom_series
-from tumortrack.tracking.files import write_estimate
+from tumortrack.io.case import Case, save_case
+from tumortrack.io.mesh_files import read_mesh, write_mesh
+from tumortrack.io.run_folder import write_estimate
+from tumortrack.io.segmentation_files import segments, write_dicom_seg, write_seg_nrrd
+from tumortrack.io.volume import read_labels
+from tumortrack.simulation.phantom.dicom import write_dicom_series
 
 PARTS = ("kidney", "tumor_1", "tumor_2", "tumor_3")  # the four blobs
 ORIENTATIONS = ("LPS", "RAS", "SAR", "PIL", "ALI")

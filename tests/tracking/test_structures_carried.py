@@ -8,8 +8,8 @@ import pytest
 import tumortrack as tt
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Mesh, SensorCloud
-from tumortrack.registration.rest_shape import RestShape
-from tumortrack.tracking.files import write_estimate
+from tumortrack.io.run_folder import write_estimate
+from tumortrack.organ.rest_shape import RestShape
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 

@@ -24,18 +24,12 @@ from tumortrack.core.types import (
     OccupancyCloud,
     SensorCloud,
 )
-from tumortrack.imaging.case import load_case
+from tumortrack.io.case import load_case
+from tumortrack.io.scene_folder import Scene, Targets, draw_targets, read_scene, read_targets
 from tumortrack.report.metrics import label_grid, target_errors
 from tumortrack.report.protocol import evaluate_scene, evaluate_scenes
 from tumortrack.report.summary import headlines, summarise, target_text
-from tumortrack.simulate.scene import SceneRecipe
-from tumortrack.simulate.scene_folder import (
-    Scene,
-    Targets,
-    draw_targets,
-    read_scene,
-    read_targets,
-)
+from tumortrack.simulation.scene import SceneRecipe
 from tumortrack_devices.sources.virtual import VirtualSourceConfig
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 
+from tumortrack.core.camera import deproject_pixels
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.values import Observation
-from tumortrack.sense.camera import deproject_pixels
 
 MOST_SEEN = 20_000  # points shown
 

@@ -19,23 +19,17 @@ from jaxtyping import Float32, Float64
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
+from tumortrack.core.camera import d405
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import perpendicular, rigid, rotation_onto, transform_points, unit
+from tumortrack.core.render import render_depth
 from tumortrack.core.types import Anatomy, DepthFrame, Intrinsics, Mesh
-from tumortrack.sense.camera import d405
-from tumortrack.sense.noise import D405_NOISE, NoiseConfig, add_noise
-from tumortrack.sense.render import render_depth
-from tumortrack.simulate.elastic.body import (
-    BodyConfig,
-    Points,
-    body_of,
-    length_over_kidney,
-    reduced_organ,
-)
-from tumortrack.simulate.elastic.loads import ReducedProblem, in_bed
-from tumortrack.simulate.elastic.modes import LEVER_MM
-from tumortrack.simulate.scene import PoseConfig, sample_pose
+from tumortrack.organ.body import BodyConfig, Points, body_of, length_over_kidney, reduced_organ
+from tumortrack.organ.loads import ReducedProblem, in_bed
+from tumortrack.organ.modes import LEVER_MM
+from tumortrack.simulation.noise import D405_NOISE, NoiseConfig, add_noise
+from tumortrack.simulation.scene import PoseConfig, sample_pose
 from tumortrack_devices.pulled import PulledStates
 
 SHAFT_MM = 4.0  # an instrument's radius

@@ -16,13 +16,13 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64, UInt8
 
+from tumortrack.core.camera import plausible
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import read_rigid
 from tumortrack.core.packages import to_install
 from tumortrack.core.store import read_file
 from tumortrack.core.types import DepthFrame, Intrinsics
-from tumortrack.sense.camera import plausible
 
 Rows = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 

@@ -6,7 +6,7 @@ from functools import cache
 from typing import Any
 
 from elastic_objects import UP, organ
-from tumortrack.simulate.elastic.body import BodyConfig
+from tumortrack.organ.body import BodyConfig
 from tumortrack_devices.player import ScenePlayer, ScenePlayerConfig
 
 COARSE = BodyConfig(cells=300, modes=24, responses=100, patches=250)

@@ -16,7 +16,7 @@ from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import read_rigid
 from tumortrack.core.store import MANIFEST, read_json, sha256_of
-from tumortrack.imaging.case import Case, load_case
+from tumortrack.io.case import Case, load_case
 
 KIT_FILE = "kit.json"
 LEAST_BEADS = 4  # three fix a frame; the fourth shows that one of them is wrong

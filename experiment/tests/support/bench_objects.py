@@ -10,18 +10,18 @@ import trimesh
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 
+from tumortrack.case.surface import surfaces
+from tumortrack.core.camera import d405
 from tumortrack.core.config import to_builtins
 from tumortrack.core.geometry import rigid, transform_points
-from tumortrack.core.mesh_files import write_mesh
+from tumortrack.core.render import render_depth
 from tumortrack.core.store import MANIFEST, new_folder, sha256_of, write_atomically, write_json
 from tumortrack.core.types import DepthFrame, LabelVolume, Mesh, Volume
-from tumortrack.imaging.case import Case, save_case
-from tumortrack.imaging.nifti import write_volume_nifti
-from tumortrack.imaging.surface import surfaces
-from tumortrack.sense.camera import d405
-from tumortrack.sense.files import depth_png, intrinsics_json
-from tumortrack.sense.noise import D405_NOISE, NoiseConfig, add_noise
-from tumortrack.sense.render import render_depth
+from tumortrack.io.case import Case, save_case
+from tumortrack.io.depth_files import depth_png, intrinsics_json
+from tumortrack.io.mesh_files import write_mesh
+from tumortrack.io.nifti import write_volume_nifti
+from tumortrack.simulation.noise import D405_NOISE, NoiseConfig, add_noise
 from tumortrack_experiment.kit_file import Bead, Kit, KitPart
 
 BEADS_MM = np.array(

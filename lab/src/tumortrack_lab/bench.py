@@ -29,25 +29,25 @@ import numpy as np
 import pandas as pd
 from tumortrack.registration.build import build_model
 
+from tumortrack.case.surface import surfaces
 from tumortrack.cli.console import progress_bar, say
+from tumortrack.core.cloud import thin_cloud
 from tumortrack.core.errors import ArtifactError, TumortrackError
 from tumortrack.core.estimate import FollowOptions
 from tumortrack.core.geometry import rigid
 from tumortrack.core.process import available_cores
+from tumortrack.core.raster import label_grid
 from tumortrack.core.types import Anatomy, SensorCloud
-from tumortrack.imaging.nifti import write_nifti
-from tumortrack.imaging.raster import label_grid
-from tumortrack.imaging.surface import surfaces
-from tumortrack.models.folder import save_model
-from tumortrack.models.report import grid_over
-from tumortrack.phantom.digital import PhantomParameters, phantom_labels
+from tumortrack.io.model_folder import save_model
+from tumortrack.io.nifti import write_nifti
+from tumortrack.io.ply import write_cloud_ply
 from tumortrack.registration.config import clinic
+from tumortrack.registration.frame import grid_over
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
-from tumortrack.sense.cloud import thin_cloud
-from tumortrack.sense.ply import write_cloud_ply
-from tumortrack.simulate.deform import DragConfig
-from tumortrack.simulate.scene import SceneConfig, SceneRecipe, Simulator
+from tumortrack.simulation.deform import DragConfig
+from tumortrack.simulation.phantom.digital import PhantomParameters, phantom_labels
+from tumortrack.simulation.scene import SceneConfig, SceneRecipe, Simulator
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.document import cpu_name

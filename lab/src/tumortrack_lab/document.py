@@ -27,10 +27,10 @@ import pandas as pd
 from scipy.stats import binomtest
 
 import tumortrack
+from tumortrack.assessment.fingerprint import fingerprint
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.process import available_cores
-from tumortrack.tracking.fingerprint import fingerprint
 
 _SPREAD = ("median", "90 %", "95 %", "worst")
 

@@ -11,11 +11,11 @@ import numpy as np
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.io.scene_folder import Scene, Targets
+from tumortrack.organ.rest_shape import distance_of
 from tumortrack.registration.model import RegistrationModel
-from tumortrack.registration.rest_shape import distance_of
 from tumortrack.report.metrics import outward_miss, surface_distances
 from tumortrack.report.rivals import best_rigid_pose, rigid_fit
-from tumortrack.simulate.scene_folder import Scene, Targets
 from tumortrack.tracking.tracker import Tracker
 
 _RIGID = ("rigid_", "rigid_fit_")  # prefixes of errors: of the best rigid pose, of the rigid fit

@@ -20,15 +20,15 @@ from typing import Any
 import numpy as np
 
 import tumortrack
+from tumortrack.assessment.bound_factor import BoundFactor
+from tumortrack.assessment.fingerprint import fingerprint
 from tumortrack.core import store
 from tumortrack.core.assessment import deciding
 from tumortrack.core.config import Config, from_builtins, to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.rigid_fit import matched_vertices
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.simulate.scene_folder import Scene, list_scenes
-from tumortrack.tracking.bound_factor import BoundFactor
-from tumortrack.tracking.fingerprint import fingerprint
+from tumortrack.io.scene_folder import Scene, list_scenes
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.world.scenes import simplified
 

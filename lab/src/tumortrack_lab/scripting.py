@@ -17,11 +17,11 @@ import pandas as pd
 import tyro
 
 import tumortrack as tt
+from tumortrack.assessment.fingerprint import fingerprint
 from tumortrack.cli.console import model_folder, progress_bar
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.process import available_cores
-from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.document import ReportWriter, make_folder
 

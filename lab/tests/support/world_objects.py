@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 
 from tumortrack.core.types import Anatomy, LabelVolume, Mesh
-from tumortrack.imaging.case import Case
+from tumortrack.io.case import Case
 from tumortrack_lab.world.organ import Organ
 from tumortrack_lab.world.scenes import World, WorldConfig
 from tumortrack_lab.world.tets import tetrahedralise

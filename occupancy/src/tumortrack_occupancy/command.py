@@ -30,8 +30,8 @@ class Onnx:
     overwrite: bool = False
 
     def run(self) -> None:
-        from tumortrack.imaging.case import holds_case
-        from tumortrack.models.folder import has_shape, read_model_manifest
+        from tumortrack.io.case import holds_case
+        from tumortrack.io.model_folder import has_shape, read_model_manifest
 
         out = self.out
         if out.suffix != ".onnx":

@@ -6,8 +6,8 @@ from typing import Literal
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
-from tumortrack.models.model import ModelConfig
-from tumortrack.simulate.scene import SceneConfig
+from tumortrack.registration.base_model import ModelConfig
+from tumortrack.simulation.scene import SceneConfig
 from tumortrack_occupancy.encoders import EncoderConfig
 from tumortrack_occupancy.normalisation import Aligned, CloudBox
 

@@ -16,8 +16,8 @@ from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.evidence import Evidence
 from tumortrack.core.report import Finding, FitReport
 from tumortrack.core.types import Anatomy, CameraLabels, Look, OccupancyCloud, SensorCloud
-from tumortrack.models.in_distribution import check_in_distribution
-from tumortrack.models.report import Frame, Rng, describe_parts, grid_over, residuals
+from tumortrack.registration.frame import Frame, Rng, describe_parts, grid_over, residuals
+from tumortrack.registration.in_distribution import check_in_distribution
 from tumortrack_occupancy import volume
 from tumortrack_occupancy.inference import Inference
 from tumortrack_occupancy.kernels import leading

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 from tumortrack.core.errors import PackageError
 from tumortrack.core.packages import to_install
 from tumortrack.core.types import Anatomy
-from tumortrack.imaging.case import Case
-from tumortrack.models.method import Locator, Preset, TrainingStatus, TrainOptions
-from tumortrack.models.model import Model
+from tumortrack.io.case import Case
+from tumortrack.registration.base_model import Model
 from tumortrack.registration.config import Rotations
+from tumortrack.registration.method import Locator, Preset, TrainingStatus, TrainOptions
 
 if TYPE_CHECKING:
     from tumortrack_occupancy.config import TrainConfig
@@ -43,7 +43,7 @@ def paper(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
 
 
 class OccupancyMethod:
-    """See ``tumortrack.models.method.Method``."""
+    """See ``tumortrack.registration.method.Method``."""
 
     presets: Mapping[str, Preset] = {"quick": quick, "paper": paper}
 

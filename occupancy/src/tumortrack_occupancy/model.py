@@ -15,8 +15,8 @@ from safetensors.torch import load, save
 
 from tumortrack.core.config import from_builtins
 from tumortrack.core.errors import InputError
-from tumortrack.models.folder import read_tensors
-from tumortrack.models.model import Model
+from tumortrack.io.model_folder import read_tensors
+from tumortrack.registration.base_model import Model
 from tumortrack_occupancy.config import TrainConfig
 from tumortrack_occupancy.hardware import choose_device
 from tumortrack_occupancy.network import OccupancyNetwork

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from tumortrack.core.types import Anatomy
 from tumortrack.registration.config import Rotations
-from tumortrack.sense.clutter import ClutterConfig
-from tumortrack.sense.noise import D405_NOISE
-from tumortrack.simulate.deform import ChainConfig, DragConfig, StretchConfig
-from tumortrack.simulate.deform.drag import CONFIGURATIONS
-from tumortrack.simulate.scene import OccupancyConfig, PoseConfig, SceneConfig
+from tumortrack.simulation.clutter import ClutterConfig
+from tumortrack.simulation.deform import ChainConfig, DragConfig, StretchConfig
+from tumortrack.simulation.deform.drag import CONFIGURATIONS
+from tumortrack.simulation.noise import D405_NOISE
+from tumortrack.simulation.scene import OccupancyConfig, PoseConfig, SceneConfig
 from tumortrack_occupancy.config import MlpDecoderConfig, NetworkConfig, Schedule, TrainConfig
 from tumortrack_occupancy.encoders.pointnet2 import PointNet2Config, SetAbstraction
 from tumortrack_occupancy.normalisation import Aligned, CloudBox

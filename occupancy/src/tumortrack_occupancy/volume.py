@@ -12,10 +12,10 @@ from scipy import ndimage
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.grid import grown_box, tight_box
 from tumortrack.core.mesh_query import surface_distance
 from tumortrack.core.report import Finding
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, OUTSIDE, Mesh, OccupancyCloud
-from tumortrack.imaging.grid import grown_box, tight_box
 from tumortrack_occupancy.kernels import trilinear
 
 AT_ONCE = 2**18  # queries; bounds the memory for any grid

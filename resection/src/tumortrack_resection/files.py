@@ -15,12 +15,12 @@ import numpy as np
 
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError, NoPlan
-from tumortrack.core.mesh_files import read_mesh, write_mesh
 from tumortrack.core.organ import is_tumor, organ_first
 from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.types import Mesh
+from tumortrack.io.mesh_files import read_mesh, write_mesh
+from tumortrack.io.ply import cloud_ply
 from tumortrack.live.values import PublishedFrame
-from tumortrack.sense.ply import cloud_ply
 from tumortrack_resection.arms.config import CellConfig
 from tumortrack_resection.budget import ErrorBudget
 from tumortrack_resection.motions import JOINTS, Motions, MotionStage, Stage

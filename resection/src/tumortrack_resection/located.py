@@ -16,13 +16,13 @@ from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.evidence import CAMERA
 from tumortrack.core.geometry import rigid
-from tumortrack.core.mesh_files import read_mesh
 from tumortrack.core.organ import KIDNEY, is_tumor, organ_first, organ_name
 from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.store import MANIFEST, read_json
 from tumortrack.core.types import ORGAN, Mesh, OccupancyCloud
-from tumortrack.sense.ply import parse_ply_properties
-from tumortrack.tracking.files import MARGIN, read_report
+from tumortrack.io.mesh_files import read_mesh
+from tumortrack.io.ply import parse_ply_properties
+from tumortrack.io.run_folder import MARGIN, read_report
 from tumortrack_resection.values import POOR_ESTIMATE, Located, name_of, organ_surface
 
 STAND_MM = 120.0  # height of the organ's lowest point over the table, if unknown

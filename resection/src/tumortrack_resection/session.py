@@ -27,6 +27,7 @@ from tumortrack.core.halt import Halt
 from tumortrack.core.organ import KIDNEY, Organ, organ_first, organ_name
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.io.model_folder import patient_of
 from tumortrack.live.cameras import CameraSetup
 from tumortrack.live.session import Arms, Session, check_report, named_sinks, open_sinks
 from tumortrack.live.spec import SOURCES
@@ -41,7 +42,6 @@ from tumortrack.live.values import (
     TrackingResult,
 )
 from tumortrack.live.workers import SinkWorker
-from tumortrack.models.folder import patient_of
 from tumortrack.tracking.options import CameraOptions, model_folder, options_from
 from tumortrack_devices.sources.virtual import VirtualSourceConfig
 from tumortrack_devices.viewer.scene import bare_faces

@@ -23,7 +23,7 @@ from tumortrack.core.geometry import Points, triangles_of, turned_by, unit
 from tumortrack.core.report import FitReport, NextEvidence
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.motion import ElasticMotion
-from tumortrack.sense.noise import CAMERA_STD
+from tumortrack.simulation.noise import CAMERA_STD
 
 _DEFAULTS = GaussNewtonConfig()
 _PLACES = 200  # on the organ's surface

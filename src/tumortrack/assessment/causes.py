@@ -16,19 +16,19 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from tumortrack.assessment.advice import Advisor, least_sure
+from tumortrack.core.cloud import thin_cloud
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import Points, rotation_onto, transform_points, triangles_of
 from tumortrack.core.report import Cause, Check, Likely
 from tumortrack.core.tables import read_table
 from tumortrack.core.types import Look, Mesh, SensorCloud
-from tumortrack.models.in_distribution import spread_mm
-from tumortrack.models.model import Model
+from tumortrack.core.units import Unit, likely_unit
+from tumortrack.registration.base_model import Model
 from tumortrack.registration.gauss_newton import refine
+from tumortrack.registration.in_distribution import spread_mm
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion
-from tumortrack.sense.cloud import thin_cloud
-from tumortrack.sense.units import Unit, likely_unit
 
 # By cause: what it is called, and what to do about it.
 _WORDS = read_table("tumortrack.assessment", "causes.toml", dict[str, tuple[str, str]])

@@ -10,8 +10,8 @@ from jaxtyping import Bool
 
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.render import render_depth
 from tumortrack.core.types import DepthFrame, Intrinsics, Look, Mesh, SensorCloud
-from tumortrack.sense.render import render_depth
 
 _ON = 1 / 3  # of what is behind: on the surface
 _AGAINST = 3.0  # pixels that a pixel that is seen through outweighs

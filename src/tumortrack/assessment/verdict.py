@@ -1,23 +1,42 @@
-"""Checks of an estimate, the same for files and live frames: good, or poor for a stated reason."""
+"""What an estimate is worth, the same for files and live frames: its assessment.
+
+``judged`` bounds it and finds it good, or poor for a stated reason; ``assessed`` completes the
+answer that is given: causes, advice, what to learn next.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Literal
 
 import msgspec
 import numpy as np
 
+from tumortrack.assessment.advice import next_evidence
 from tumortrack.assessment.bound import POOR_MM, bounds_of, depths_within_mm
+from tumortrack.assessment.causes import Known, explained
 from tumortrack.assessment.sight import Sight, sight_of
 from tumortrack.core.assessment import Assessment, ErrorBound, deciding
 from tumortrack.core.errors import NotThisOrgan
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.report import EvidenceReport, Finding, FitReport, Kind, LooksReport
+from tumortrack.core.report import (
+    EvidenceReport,
+    Finding,
+    FitReport,
+    Kind,
+    Likely,
+    LooksReport,
+    NextEvidence,
+)
 from tumortrack.core.types import Look
-from tumortrack.models.in_distribution import FIT_FACTOR, RIVAL_COST
-from tumortrack.sense.noise import CAMERA_STD
+from tumortrack.io.model_folder import weakness_of
+from tumortrack.registration.base_model import Model
+from tumortrack.registration.in_distribution import FIT_FACTOR, RIVAL_COST
+from tumortrack.registration.model import RegistrationModel
+from tumortrack.simulation.noise import CAMERA_STD
 
 # Where no bound is known: largest standard deviation of a tumor's centre, and largest
 # distance to it in another fit that is nearly as likely.
@@ -42,6 +61,7 @@ _MAX_UNSEEN = 0.1  # share of the organ's image without points of a cloud
 _OUTVOTED = 3  # later pieces at that place that agree with the answer, and so with each other
 _THERE_MM = 15.0  # from what the answer has there: how far apart touches of one spot may lie
 _OF_A_MOMENT = "held", "free"  # they say it again in each frame, as long as it is so
+Advise = Literal["all", "touches", "nothing"]
 
 
 def judged(
@@ -84,13 +104,48 @@ def judged(
         seen_through=sight.through,
         in_sight=sight.in_sight,
         doubted_in_sight=doubted,
-        timings=timed(report, "judge", start_s),
+        timings=_timed(report, "judge", start_s),
     )
     assessment = Assessment(bounds=bounds, factor=factor, finding=finding)
     return replace(estimate, report=report, assessment=assessment)
 
 
-def timed(report: FitReport, stage: str, start_s: float) -> dict[str, float]:
+def assessed(
+    estimate: Estimate,
+    looks: Sequence[Look],
+    model: Model,
+    known: Known = MappingProxyType({}),
+    advise: Advise = "nothing",
+    part: int | None = None,
+) -> Estimate:
+    """A judged estimate with whose it is, the causes if it is poor, and what to learn next.
+
+    Args:
+        known: causes of frames before, which are not searched for again.
+        advise: what advice is made of.
+        part: the number of the one that it is for; None: the tumor that is least sure.
+    """
+    start_s, report, said = time.perf_counter(), estimate.report, estimate.assessment
+    finding, causes, advice = said.finding, tuple[Likely, ...](), ""
+    if weakness := weakness_of(model.provenance):
+        finding = Finding("model", {"words": weakness})
+    elif finding is not None:
+        causes, advice = explained(model, looks, estimate, known)
+    pays = tuple[NextEvidence, ...]()
+    if isinstance(model, RegistrationModel) and advise != "nothing":
+        pays = next_evidence(estimate, part, model.config.refine, advise == "touches")
+    return replace(
+        estimate,
+        assessment=msgspec.structs.replace(
+            said, finding=finding, causes=causes, advice=advice, next_evidence=pays
+        ),
+        report=msgspec.structs.replace(report, timings=_timed(report, "explain", start_s)),
+        patient=model.patient,
+        organ=model.organ,
+    )
+
+
+def _timed(report: FitReport, stage: str, start_s: float) -> dict[str, float]:
     """The report's timings with those of a stage that ends now."""
     took_s, timings = time.perf_counter() - start_s, report.timings
     all_s, total_s = took_s + timings.get(stage, 0.0), took_s + timings.get("total", 0.0)

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from tumortrack.case.options import ORGAN_HU, PrepareOptions
 from tumortrack.cli.console import (
     Device,
     keep_loaded,
@@ -20,7 +21,6 @@ from tumortrack.cli.console import (
     say_notes,
     say_table,
 )
-from tumortrack.imaging.options import ORGAN_HU, PrepareOptions
 from tumortrack.tracking.options import ExportOptions, SimulateOptions, check_grid
 
 
@@ -58,7 +58,7 @@ class Prepare(PrepareOptions):
         words = ", ".join(map(str, inputs))
         with progress_of("the case's model", f"reading {words}, making surfaces ...") as made:
             from tumortrack import api
-            from tumortrack.models.folder import is_finished, read_model_manifest, weakness_of
+            from tumortrack.io.model_folder import is_finished, read_model_manifest, weakness_of
 
             case = api.prepare(
                 inputs, folder, overwrite=self.overwrite, segment=self.segment,
@@ -161,8 +161,8 @@ class Evaluate:
 
     def write(self) -> dict[str, Any]:
         """Write the report, replacing an earlier one; returns it."""
-        from tumortrack.models.folder import patient_of, read_model_manifest
-        from tumortrack.simulate.scene_folder import list_scenes
+        from tumortrack.io.model_folder import patient_of, read_model_manifest
+        from tumortrack.io.scene_folder import list_scenes
 
         folder = model_folder(self.model)
         patient = patient_of(read_model_manifest(folder), folder)

@@ -44,12 +44,12 @@ class Demo:
     def run(self) -> None:
         from tumortrack import api
         from tumortrack.report.summary import conclusions, scene_table
-        from tumortrack.simulate import datasets
+        from tumortrack.simulation import datasets
 
         if not 0 < self.minutes < float("inf"):
             raise InputError(f"--minutes {self.minutes:g} must be more than 0.")
         if self.preset != "clinic":
-            from tumortrack.models.method import method_of_preset
+            from tumortrack.registration.method import method_of_preset
 
             method_of_preset(self.preset)  # what is missing is said first
             command("plan")
@@ -82,8 +82,8 @@ class Demo:
     def _show_paper(self, ours: dict[str, Any]) -> None:
         """The paper's method on the same CT and scenes, compared with the default method."""
         from tumortrack.cli.locate import Locate
+        from tumortrack.io.scene_folder import list_scenes
         from tumortrack.report.summary import headlines
-        from tumortrack.simulate.scene_folder import list_scenes
 
         out, paper = self.out, self.out / "paper"
         say(f"the paper's method, preset {self.preset}: training for {self.minutes:g} minutes")

@@ -21,8 +21,8 @@ from tumortrack.cli.console import Device, say
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.packages import to_install
 from tumortrack.core.process import available_cores
-from tumortrack.models.method import GROUP
 from tumortrack.native import LIBRARIES, library
+from tumortrack.registration.method import GROUP
 
 # What each distribution is for, and each of its extras; "": what it always needs.
 PURPOSES = {
@@ -112,7 +112,7 @@ def _plug_ins() -> Iterator[Status]:
     """What other packages add; each is imported. Working commands are in ``--help``, working
     methods above; of our own distributions only faults are told."""
     from tumortrack.live import spec
-    from tumortrack.simulate.deform import installed
+    from tumortrack.simulation.deform import installed
 
     added = [(f"{e.what} {e.kind}", e.package, e.fault) for e in spec.extensions()]
     added += [(f"deformation {e.name}", e.package, e.fault) for e in installed.extensions()]

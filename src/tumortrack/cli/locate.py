@@ -60,8 +60,8 @@ class Locate(LocateOptions):
     def run(self) -> int:
         """The exit status, by the verdict."""
         from tumortrack import api
+        from tumortrack.io.run_folder import has_no_estimate
         from tumortrack.report.seen import PAGE
-        from tumortrack.tracking.files import has_no_estimate
 
         check_grid(self.grid)
         console.stderr = self.json

@@ -13,9 +13,9 @@ from tyro.conf import Positional
 from tumortrack.cli.console import Device, keep_loaded, live_line, progress_of, say, say_notes
 
 if TYPE_CHECKING:
-    from tumortrack.imaging.case import Case
-    from tumortrack.models.method import TrainingStatus
-    from tumortrack.models.model import Model
+    from tumortrack.io.case import Case
+    from tumortrack.registration.base_model import Model
+    from tumortrack.registration.method import TrainingStatus
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +57,7 @@ class Train:
 
     def run(self) -> None:
         from tumortrack import api
-        from tumortrack.models import folder
+        from tumortrack.io import model_folder as folder
 
         case = api.load_case(self.case)
         train = partial(
@@ -76,7 +76,7 @@ class Train:
 
     def _make(self, make: Callable[..., Model]) -> None:
         """A model of the default method."""
-        from tumortrack.models import folder
+        from tumortrack.io import model_folder as folder
 
         say("nothing needs to be learnt: the case itself can stand wherever a MODEL is asked for.")
         with progress_of("making the model") as progress:
@@ -86,8 +86,8 @@ class Train:
 
     def _train(self, train: Callable[..., Model], case: Case) -> None:
         """A network."""
-        from tumortrack.models import folder
-        from tumortrack.models.method import method_of_preset
+        from tumortrack.io import model_folder as folder
+        from tumortrack.registration.method import method_of_preset
 
         method_of_preset(self.preset)  # what is missing is said first
         say("starting ...")

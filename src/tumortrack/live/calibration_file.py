@@ -9,10 +9,10 @@ from typing import Any, Literal
 import numpy as np
 
 from tumortrack.core.config import Config, from_builtins
-from tumortrack.core.csv_tables import number_in, text_of
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import read_rigid, rigid
 from tumortrack.core.store import read_file, read_json
+from tumortrack.io.csv_tables import number_in, text_of
 from tumortrack.live.values import PublishedFrame
 
 _LARGEST_MM, _LARGEST_DEG = 100.0, 10.0  # with more, it is no calibration

@@ -13,12 +13,12 @@ import numpy as np
 
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.geometry import HERE, Affine
+from tumortrack.io.depth_files import read_poses
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.poses import CameraPoses
 from tumortrack.live.spec import POSES, SOURCES
 from tumortrack.live.values import CameraView, Observation, PublishedFrame, SourceConfig
 from tumortrack.live.workers import SourceWorker
-from tumortrack.sense.files import read_poses
 
 # Frames so far apart go together: free-running cameras of 30 Hz are up to 17 ms apart, and an organ
 # that is pushed at 50 mm/s moves by 1 mm, one standard deviation of where a camera stands

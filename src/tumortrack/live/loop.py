@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from tumortrack.core.assessment import Quality
+from tumortrack.core.camera import d405, with_depth_error
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.estimate import Estimate
@@ -25,15 +26,14 @@ from tumortrack.core.evidence import Evidence
 from tumortrack.core.halt import Halt
 from tumortrack.core.report import Finding
 from tumortrack.core.types import DepthError, DepthFrame, Intrinsics
+from tumortrack.io.depth_files import DepthCorrection
 from tumortrack.live import values as live
 from tumortrack.live.cameras import Cameras
 from tumortrack.live.meter import RunStatistics
 from tumortrack.live.values import CameraView, Observation, SourceLost, TrackingResult
 from tumortrack.live.views import OrganInView, Scan, ViewsLocator, camera_words, timed
 from tumortrack.live.workers import OPENING_S, SinkWorker, SourceWorker
-from tumortrack.sense.camera import d405, with_depth_error
-from tumortrack.sense.files import DepthCorrection
-from tumortrack.sense.region import Hints, RegionConfig, organ_points
+from tumortrack.segmentation import Hints, RegionConfig, organ_points
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 
 _QUIET = 0.8  # of stale_s: silence is reported while the last result is still valid

@@ -11,11 +11,11 @@ from typing import ClassVar
 import numpy as np
 
 from tumortrack.core.config import Config
-from tumortrack.core.csv_tables import read_rows, whole_in
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import HERE, Affine, rigid
 from tumortrack.core.report import Finding
 from tumortrack.core.store import read_file
+from tumortrack.io.csv_tables import read_rows, whole_in
 from tumortrack.live.values import Observation
 
 # Between two poses an arm that accelerates by 1 m/s2 deviates from linear interpolation by at most

@@ -15,6 +15,8 @@ from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, StorageError
 from tumortrack.core.patient import Patient
+from tumortrack.io.depth_files import DepthCorrection, read_camera
+from tumortrack.io.model_folder import patient_of, read_model_manifest
 from tumortrack.live.cameras import Cameras, CameraSetup, camera_setup
 from tumortrack.live.loop import Loop, LoopConfig, summary
 from tumortrack.live.spec import SINKS, TOOLS
@@ -27,9 +29,7 @@ from tumortrack.live.values import (
     TrackingResult,
 )
 from tumortrack.live.workers import SinkWorker, SourceWorker
-from tumortrack.models.folder import patient_of, read_model_manifest
-from tumortrack.models.model import Model
-from tumortrack.sense.files import DepthCorrection, read_camera
+from tumortrack.registration.base_model import Model
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.options import TrackOptions, model_folder
 from tumortrack.tracking.tracker import FollowerConfig, Tracker

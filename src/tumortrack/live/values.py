@@ -28,7 +28,7 @@ from tumortrack.core.report import Finding
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
 
 if TYPE_CHECKING:
-    from tumortrack.sense.region.tissue import Click, TissueClassifier
+    from tumortrack.segmentation.tissue import Click, TissueClassifier
 
 
 class SourceLost(TumortrackError):
@@ -373,8 +373,8 @@ class Controls:
     def click(self, seen: Observation, place_mm: Float[np.ndarray, " 3"], organ: bool) -> None:
         """The user clicked on this place (camera frame): on the ``organ``, or beside it. Raises
         InputError, and changes nothing: there is no picture, or it shows too little there."""
-        from tumortrack.sense.camera import project
-        from tumortrack.sense.region.tissue import sample_click, teach
+        from tumortrack.core.camera import project
+        from tumortrack.segmentation.tissue import sample_click, teach
 
         if seen.picture is None or not isinstance(seen.content, DepthFrame):
             raise InputError(

@@ -20,10 +20,10 @@ from tumortrack.core.report import Finding, ScanReport
 from tumortrack.core.types import DepthFrame, Intrinsics, Look, SensorCloud
 from tumortrack.live.tools import Tools
 from tumortrack.live.values import CameraView, Observation, PublishedFrame, SinkContext
-from tumortrack.sense.measured_noise import DepthNoise
-from tumortrack.sense.region import Hints, RegionConfig, organ_points
-from tumortrack.sense.region.tissue import TissueClassifier
-from tumortrack.sense.region.watch import TableWatch
+from tumortrack.segmentation import Hints, RegionConfig, organ_points
+from tumortrack.segmentation.measured_noise import DepthNoise
+from tumortrack.segmentation.tissue import TissueClassifier
+from tumortrack.segmentation.watch import TableWatch
 from tumortrack.tracking.tracker import Follower, Tracker
 
 _NOISE_S = 1.0  # a camera's noise is measured so often: as long as a frame's other work takes
@@ -36,12 +36,9 @@ SCAN_APART_DEG = 30.0
 
 OrganInView = tuple[CameraView, SensorCloud]  # the organ's points in it
 
-UNNAMED = (
-    "the calibration names no camera_frame_id: nobody checks that frames come from the camera that "
-    "it is for"
-)
-_NAMELESS = "the source does not say whose frames it sends: nobody checks it"
-_BLIND = "no table is seen: nobody notices if the camera moves"
+_UNNAMED = "the calibration names no camera_frame_id: whose frames these are is not checked"
+_NAMELESS = "the source does not say whose frames it sends: that is not checked"
+_BLIND = "no table is seen: camera motion cannot be detected"
 _SLIDING = (
     "the table's plane is watched; a camera that slides along it, or turns about its normal, is "
     "not noticed"
@@ -67,7 +64,7 @@ class FrameCheck:
         self.watch = TableWatch(config, published.table_in_camera) if watched else None
         self.notes: list[str] = []
         if published.calibrated and not published.camera_frame_id:
-            self.notes.append(UNNAMED)
+            self.notes.append(_UNNAMED)
 
     def check(self, seen: Observation) -> str:
         """A doubt about this frame, or an empty text. Raises NoEstimate if its camera is not that

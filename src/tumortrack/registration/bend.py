@@ -22,13 +22,13 @@ from jaxtyping import Float, Float64, Int64
 
 from tumortrack.core.mesh_kernels import farthest
 from tumortrack.native import F64, kernel
+from tumortrack.organ.rest_shape import error_covariance_mm2
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.evidence import Terms
 from tumortrack.registration.gauss_newton import RegistrationResult, prior_precision
 from tumortrack.registration.looks import Looks, Residuals
 from tumortrack.registration.motion import POSE, ElasticMotion
-from tumortrack.registration.rest_shape import error_covariance_mm2
-from tumortrack.sense.noise import CAMERA_STD
+from tumortrack.simulation.noise import CAMERA_STD
 
 # Of the coefficients: hardly any; as loads like the library's would have them; strong ones.
 _STDS_MM = (0.5, 2.0, 6.0)

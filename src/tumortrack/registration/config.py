@@ -6,12 +6,12 @@ from typing import Literal
 
 from tumortrack.core.config import Config
 from tumortrack.core.types import Anatomy
-from tumortrack.models.model import ModelConfig
-from tumortrack.sense.clutter import ClutterConfig
-from tumortrack.sense.noise import D405_NOISE, CalibrationConfig
-from tumortrack.sense.occlusion import OcclusionConfig
-from tumortrack.simulate.deform import ElasticConfig
-from tumortrack.simulate.scene import PoseConfig, SceneConfig
+from tumortrack.registration.base_model import ModelConfig
+from tumortrack.simulation.clutter import ClutterConfig
+from tumortrack.simulation.deform import ElasticConfig
+from tumortrack.simulation.noise import D405_NOISE, CalibrationConfig
+from tumortrack.simulation.occlusion import OcclusionConfig
+from tumortrack.simulation.scene import PoseConfig, SceneConfig
 
 Rotations = Literal["full", "limited"]
 

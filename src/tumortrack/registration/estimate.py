@@ -13,6 +13,7 @@ from jaxtyping import Float, Float32, Float64, Int32, Int64, UInt8
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.evidence import Evidence
 from tumortrack.core.geometry import largest_std_of
+from tumortrack.core.raster import label_grid
 from tumortrack.core.report import (
     AllowedPoses,
     EvidenceReport,
@@ -26,12 +27,11 @@ from tumortrack.core.report import (
     SmoothingReport,
 )
 from tumortrack.core.types import Anatomy, CameraLabels, Look, Mesh, OccupancyCloud
-from tumortrack.imaging.raster import label_grid
-from tumortrack.models.report import Frame, describe_parts, grid_over, residuals
 from tumortrack.native import F32, F64, I32, kernel
 from tumortrack.registration.bend import BentFit
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.evidence import Known
+from tumortrack.registration.frame import Frame, describe_parts, grid_over, residuals
 from tumortrack.registration.gauss_newton import FARTHEST, RegistrationResult
 from tumortrack.registration.looks import Looks, depth_share
 from tumortrack.registration.model import RegistrationModel

@@ -22,8 +22,8 @@ from tumortrack.core.evidence import Evidence, Free, Held, Landmark, Outline, To
 from tumortrack.core.geometry import Affine, transform_points
 from tumortrack.core.mesh_query import surface_distance
 from tumortrack.core.report import EvidenceReport
+from tumortrack.organ.rest_shape import RestShape
 from tumortrack.registration.motion import POSE, ElasticMotion, seen_from_first
-from tumortrack.registration.rest_shape import RestShape
 
 _WIDTHS = 4.0  # of the robust kernel, in standard deviations
 _LEAST_WIDTH_MM = 4.0  # so that fits from starts some millimetres off are drawn

@@ -24,12 +24,12 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from tumortrack.native import F32, F64, kernel
+from tumortrack.organ.flow import BLOCK, MODES, VELOCITY, LatticeField
+from tumortrack.organ.rest_shape import DISTANCES, DistanceField, RestShape
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.evidence import EvidenceTerms, Terms
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import POSE, ElasticMotion
-from tumortrack.registration.rest_shape import DISTANCES, DistanceField, RestShape
-from tumortrack.simulate.elastic.flow import BLOCK, MODES, VELOCITY, LatticeField
 
 FARTHEST = 2.0  # widths of the robust kernel: what lies beyond weighs less than 1/25
 _STRIDE = 256 + 16  # of the columns in native/fast/gauss_newton.c

@@ -10,21 +10,21 @@ from itertools import repeat
 import msgspec
 import numpy as np
 
+from tumortrack.core.cloud import FEWEST_POINTS
 from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.evidence import FEWEST_TOUCHES, Evidence
 from tumortrack.core.report import SmoothingReport
 from tumortrack.core.types import Anatomy, DepthError, Look, SensorCloud
-from tumortrack.models.report import Frame
 from tumortrack.registration.bend import BentFit
 from tumortrack.registration.estimate import EstimateMaker, Found
 from tumortrack.registration.evidence import EvidenceTerms, Known, still_known
+from tumortrack.registration.frame import Frame
 from tumortrack.registration.gauss_newton import RegistrationResult
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion, blend
 from tumortrack.registration.registration import likeliest
 from tumortrack.registration.search import PosePrior, apart_mm
-from tumortrack.sense.cloud import FEWEST_POINTS
 
 _MOVED_MM = 2.5  # between live frames: what moves farther is found again from the start
 _JUMP_MM = 10.0  # from one frame to the next: then it may have come to lie any way

@@ -19,7 +19,7 @@ from tumortrack.core.types import DepthError, PointNoise
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.evidence import EvidenceTerms
 from tumortrack.registration.motion import POSE, ElasticMotion
-from tumortrack.sense.noise import CAMERA_STD
+from tumortrack.simulation.noise import CAMERA_STD
 
 _CONTAINED_MM = 0.4  # of noise, in ``GaussNewtonConfig.sigma_mm``: a D405's at 150 mm, doubled
 _FACING = 0.15  # cosine to the line of sight: what is steeper is not told from what it stands on

@@ -18,24 +18,24 @@ import numpy as np
 from jaxtyping import Float64
 from safetensors.numpy import load, save
 
+from tumortrack.core.cloud import thin_cloud
 from tumortrack.core.config import Config, check_seed, from_builtins, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import FAR_MM
 from tumortrack.core.process import parallel_map
 from tumortrack.core.types import Anatomy, DepthError
-from tumortrack.models.folder import SHAPE, organ_of, read_tensors
-from tumortrack.models.in_distribution import InDistributionRange, fit_mm, spread_mm
-from tumortrack.models.model import Model
+from tumortrack.io.model_folder import SHAPE, organ_of, read_tensors
+from tumortrack.io.scene_folder import draw_targets
+from tumortrack.organ.rest_shape import RestShape, distances_of
+from tumortrack.registration.base_model import Model
 from tumortrack.registration.config import RegistrationConfig
 from tumortrack.registration.gauss_newton import RegistrationResult, refine
+from tumortrack.registration.in_distribution import InDistributionRange, fit_mm, spread_mm
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.registration import Registration
-from tumortrack.registration.rest_shape import RestShape, distances_of
 from tumortrack.registration.search import PosePrior
-from tumortrack.sense.cloud import thin_cloud
-from tumortrack.simulate.scene import PoseConfig, SceneRecipe, Simulator, body_for
-from tumortrack.simulate.scene_folder import draw_targets
+from tumortrack.simulation.scene import PoseConfig, SceneRecipe, Simulator, body_for
 
 _USUAL = 90  # per cent of the right fits cost no more than the usual cost
 # This share of all errors lies within this radius if each axis errs normally by 1; the others may

@@ -14,8 +14,8 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Affine, Points, largest_std_of, rigid, std_of, turned_by
 from tumortrack.core.process import parallel_for
 from tumortrack.native import F32, F64, kernel
-from tumortrack.registration.rest_shape import DISTANCES, DistanceField, RestShape
-from tumortrack.simulate.elastic.flow import FLOW, MODES, Flow, LatticeField, steps_for
+from tumortrack.organ.flow import FLOW, MODES, Flow, LatticeField, steps_for
+from tumortrack.organ.rest_shape import DISTANCES, DistanceField, RestShape
 
 POSE = 6  # unknowns before the coefficients: shift and turn
 _AT_ONCE = 4096  # points per thread

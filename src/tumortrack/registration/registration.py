@@ -29,12 +29,7 @@ import msgspec
 import numpy as np
 
 from tumortrack.core.process import parallel_map
-from tumortrack.models.in_distribution import (
-    RIVAL_COST,
-    InDistributionRange,
-    check_in_distribution,
-    check_likely,
-)
+from tumortrack.organ.rest_shape import RestShape
 from tumortrack.registration.bend import BentFit, bend
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import (
@@ -43,9 +38,14 @@ from tumortrack.registration.gauss_newton import (
     RegistrationResult,
     refine,
 )
+from tumortrack.registration.in_distribution import (
+    RIVAL_COST,
+    InDistributionRange,
+    check_in_distribution,
+    check_likely,
+)
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
-from tumortrack.registration.rest_shape import RestShape
 from tumortrack.registration.search import (
     PosePrior,
     Search,

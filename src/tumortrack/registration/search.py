@@ -18,11 +18,11 @@ from jaxtyping import Bool, Float64, Int64
 
 from tumortrack.core.geometry import Points, rotation_onto, triangles_of, turned_by, unit
 from tumortrack.core.process import parallel_for
-from tumortrack.models.in_distribution import RIVAL_COST
 from tumortrack.native import F32, F64, kernel
+from tumortrack.organ.rest_shape import DISTANCES, RestShape
+from tumortrack.registration.in_distribution import RIVAL_COST
 from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import POSE, ElasticMotion
-from tumortrack.registration.rest_shape import DISTANCES, RestShape
 
 Rotations = Float64[np.ndarray, "*n 3 3"]
 Centres = Float64[np.ndarray, "s 3"]  # of the organ, camera frame, mm

@@ -21,9 +21,9 @@ from matplotlib.text import Text
 
 from tumortrack.core import colours
 from tumortrack.core.geometry import plane_section
+from tumortrack.core.raster import voxelise
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import FIRST_TUMOR, Mesh
-from tumortrack.imaging.raster import voxelise
 from tumortrack.report.renderer import RGB, Body, Frame, ParallelView, rgb
 from tumortrack.report.wrapping import wrapped
 

@@ -131,8 +131,8 @@ def _poses(rotations: str, tilt_degrees: float) -> str:
 
 def _of_the_cases_model(case: Path) -> Content:
     """Raises ArtifactError: it is damaged."""
-    from tumortrack.imaging.case import Case
-    from tumortrack.models.folder import is_model_of, read_model_manifest
+    from tumortrack.io.case import Case
+    from tumortrack.io.model_folder import is_model_of, read_model_manifest
 
     folder = case / Case.MODEL
     if not is_model_of(folder, case):
@@ -141,8 +141,8 @@ def _of_the_cases_model(case: Path) -> Content:
 
 
 def _of_model(manifest: Content, folder: Path) -> Content:
-    from tumortrack.models.folder import training_words, weakness_of
-    from tumortrack.tracking.bound_factor import read_factor
+    from tumortrack.assessment.bound_factor import read_factor
+    from tumortrack.io.model_folder import training_words, weakness_of
 
     about, found = manifest["provenance"], read_factor(folder)
     trained = "trained for " * ("network" in manifest["config"])
@@ -177,7 +177,7 @@ def _sealed_scenes(folder: Path, scenes: Mapping[str, str]) -> Iterable[str]:
 
 
 def _folder(path: Path) -> Iterable[str]:
-    from tumortrack.imaging.dicom import NoSeries
+    from tumortrack.io.dicom import NoSeries
 
     inside = {p.name for p in path.iterdir()}
     if store.MANIFEST in inside:
@@ -217,7 +217,7 @@ def _file(path: Path) -> Iterable[str]:
 
 
 def _scene(folder: Path) -> list[str]:
-    from tumortrack.simulate.scene_folder import read_scene
+    from tumortrack.io.scene_folder import read_scene
 
     scene = read_scene(folder)
     parts = zip(scene.reference.names, scene.reference.parts, strict=True)
@@ -236,7 +236,7 @@ def _recording(path: Path) -> list[str]:
 def _volume(path: Path) -> Iterable[str]:
     import numpy as np
 
-    from tumortrack.imaging.volume import is_label_map, read_raw
+    from tumortrack.io.volume import is_label_map, read_raw
 
     raw = read_raw(path)
     names = {segment.number: f" ({segment.name})" for segment in raw.segments}
@@ -264,8 +264,8 @@ def _is_mesh(path: Path) -> bool:
 def _points(path: Path) -> list[str]:
     import numpy as np
 
-    from tumortrack.core.mesh_files import read_mesh
-    from tumortrack.sense.files import CLOUD_SUFFIXES, read_cloud, read_depth_png
+    from tumortrack.io.depth_files import CLOUD_SUFFIXES, read_cloud, read_depth_png
+    from tumortrack.io.mesh_files import read_mesh
 
     camera = path.with_name("intrinsics.json")
     if path.suffix.lower() == ".png" and camera.is_file():
@@ -287,7 +287,7 @@ def _points(path: Path) -> list[str]:
 
 
 def _noise(content: Any) -> list[str]:
-    from tumortrack.sense.measured_noise import noise_of
+    from tumortrack.segmentation.measured_noise import noise_of
 
     return [noise.words] if (noise := noise_of(content)) else []
 

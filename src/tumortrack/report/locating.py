@@ -13,10 +13,10 @@ from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.evidence import CAMERA, Evidence
-from tumortrack.core.evidence_files import read_evidence
+from tumortrack.io.evidence_files import read_evidence
+from tumortrack.io.points import PointTable, check_near_organ, read_points
 from tumortrack.report.seen import Seen
 from tumortrack.tracking.options import LocateOptions, check_grid, model_folder
-from tumortrack.tracking.points import PointTable, check_near_organ, read_points
 from tumortrack.tracking.views import (
     NO_CLOUD,
     OrganInView,
@@ -30,8 +30,8 @@ from tumortrack.tracking.views import (
 if TYPE_CHECKING:
     from tumortrack.core.estimate import Estimate
     from tumortrack.core.types import Anatomy
-    from tumortrack.models.model import Model
-    from tumortrack.tracking.slices import CarriedCt
+    from tumortrack.registration.base_model import Model
+    from tumortrack.report.slices import CarriedCt
 
 _ASK = "say where the organ is: --at COLUMN ROW, --box or --mask"
 
@@ -60,7 +60,7 @@ class Located:
 
     @cached_property
     def report(self) -> dict[str, Any]:
-        from tumortrack.tracking.files import report_entry
+        from tumortrack.io.run_folder import report_entry
 
         head = {} if self.estimate is None else report_entry(self.estimate)
         return {**head, **self.about}
@@ -68,8 +68,8 @@ class Located:
     def save(self, folder: str | Path, overwrite: bool = False) -> None:
         """Write the folder that `tumortrack locate` writes. Raises InputError: it exists and
         ``overwrite`` is False; StorageError: the disk refused."""
+        from tumortrack.io import run_folder as files
         from tumortrack.report.page import write_run_page
-        from tumortrack.tracking import files
 
         report, folder = self.report, Path(folder)
         add = partial(write_run_page, report=report, estimate=self.estimate, shown=self.seen)
@@ -154,7 +154,7 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
 
 def _points(given: Path, folder: Path, options: LocateOptions) -> PointTable | None:
     """The points of --map, checked like the model's patient before the model is loaded."""
-    from tumortrack.models.folder import has_shape, patient_of, read_model_manifest
+    from tumortrack.io.model_folder import has_shape, patient_of, read_model_manifest
 
     manifest = read_model_manifest(folder)
     patient_of(manifest, folder).check_is(options.stated, str(given))
@@ -187,7 +187,7 @@ def _no_estimate(
     error: NoEstimate, view: View, model: Model, options: LocateOptions
 ) -> dict[str, Any]:
     """The first entries of a report without an estimate."""
-    from tumortrack.tracking.files import finding_entry, report_head
+    from tumortrack.io.run_folder import finding_entry, report_head
 
     reason = str(error)
     if view.unit is not None:
@@ -205,8 +205,8 @@ def _ct(folder: Path | None, model: Model, anatomy_ct: Anatomy | None) -> Carrie
     """The CT of --case, if it has one."""
     if folder is None:
         return None
-    from tumortrack.imaging.case import load_case
-    from tumortrack.tracking.slices import CarriedCt
+    from tumortrack.io.case import load_case
+    from tumortrack.report.slices import CarriedCt
 
     case = load_case(folder)
     same = store.sha256_of(folder / store.MANIFEST) == model.provenance.get("case_sha256")

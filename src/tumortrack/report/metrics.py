@@ -16,9 +16,9 @@ from jaxtyping import Float
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points, transform_points
 from tumortrack.core.mesh_query import SPACING_MM, contains, nearest_places, surface_samples
+from tumortrack.core.raster import label_grid
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
-from tumortrack.imaging.raster import label_grid
-from tumortrack.simulate.scene_folder import Targets
+from tumortrack.io.scene_folder import Targets
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from tumortrack.core.types import Mesh
 from tumortrack.report import pictures, seen
 
 if TYPE_CHECKING:
-    from tumortrack.simulate.scene_folder import Scene
+    from tumortrack.io.scene_folder import Scene
 
 _ORGAN_CELL_MM, _TUMOR_CELL_MM = 2.5, 2.0
 _MAX_POINTS, _AROUND_MM = 2000, 12.0  # of the cloud, in a box so much larger than the organ's

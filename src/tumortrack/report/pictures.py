@@ -16,6 +16,7 @@ from jaxtyping import Float, Shaped, UInt8
 from PIL import Image, ImageDraw, ImageFilter, ImageFont
 
 from tumortrack.core import colours
+from tumortrack.core.camera import deproject
 from tumortrack.core.colours import Colour, name_colour, structure_colour
 from tumortrack.core.estimate import Estimate, verdict_words
 from tumortrack.core.geometry import DIRECTIONS_LPS, Points, transform_points
@@ -26,13 +27,12 @@ from tumortrack.core.store import write_atomically
 from tumortrack.core.types import Anatomy, DepthFrame, LabelVolume, Mesh, SensorCloud, Volume
 from tumortrack.report.renderer import Body, ParallelView, corner_normals, render, rgb
 from tumortrack.report.seen import Seen, spots
+from tumortrack.report.slices import ORIENTATIONS, SlicePlane, outlined, plane_through
 from tumortrack.report.wrapping import wrapped
-from tumortrack.sense.camera import deproject
-from tumortrack.sense.region.working_image import ORGAN, sampled_pixels
-from tumortrack.tracking.slices import ORIENTATIONS, SlicePlane, outlined, plane_through
+from tumortrack.segmentation.working_image import ORGAN, sampled_pixels
 
 if TYPE_CHECKING:
-    from tumortrack.simulate.scene_folder import Scene
+    from tumortrack.io.scene_folder import Scene
 
 Panel = tuple[str, Image.Image]  # with its caption
 Plane = tuple[tuple[float, ...], tuple[float, ...]]  # directions of columns and rows

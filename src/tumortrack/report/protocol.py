@@ -16,11 +16,11 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import FAR_MM, Estimate
 from tumortrack.core.process import undisturbed
 from tumortrack.core.store import read_json, write_json, writing
-from tumortrack.models.model import Model
+from tumortrack.io.scene_folder import Scene, list_scenes, read_scene
+from tumortrack.registration.base_model import Model
 from tumortrack.report import metrics
 from tumortrack.report.rivals import rivals_of
 from tumortrack.report.summary import MEANING, NO_RIVALS, RULE, summarise, worst_center
-from tumortrack.simulate.scene_folder import Scene, list_scenes, read_scene
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.options import model_folder
 from tumortrack.tracking.tracker import Tracker

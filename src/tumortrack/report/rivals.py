@@ -16,19 +16,19 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from tumortrack.core.cloud import thin_cloud
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Affine, rigid, transform_points
 from tumortrack.core.rigid_fit import fit_over_volume, kabsch, matched_vertices
 from tumortrack.core.types import Anatomy, Mesh, SensorCloud
-from tumortrack.models.model import Model
+from tumortrack.io.scene_folder import Scene
+from tumortrack.organ.flow import Flow, LatticeField
+from tumortrack.organ.rest_shape import DistanceField, RestShape
+from tumortrack.registration.base_model import Model
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import POSE, Pose, residual_rows
-from tumortrack.registration.rest_shape import DistanceField, RestShape
 from tumortrack.report import metrics
 from tumortrack.report.summary import RIVALS, judged_parts
-from tumortrack.sense.cloud import thin_cloud
-from tumortrack.simulate.elastic.flow import Flow, LatticeField
-from tumortrack.simulate.scene_folder import Scene
 
 _POINTS = 1000  # of the cloud, as many as the estimate uses
 _WIDTH_MM = 5.0  # of the robust kernel, the initial one of the elastic fit

@@ -16,7 +16,7 @@ from tumortrack.core.types import DepthFrame, SensorCloud
 if TYPE_CHECKING:
     from tumortrack.core.assessment import Assessment
     from tumortrack.core.estimate import Estimate
-    from tumortrack.tracking.slices import CarriedCt
+    from tumortrack.report.slices import CarriedCt
 
 PAGE, PICTURE = "index.html", "picture.png"
 

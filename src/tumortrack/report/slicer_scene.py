@@ -23,13 +23,13 @@ from tumortrack.core.assessment import Assessment, centre_label
 from tumortrack.core.colours import Colour, part_colour, structure_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS
-from tumortrack.core.mesh_files import write_mesh
 from tumortrack.core.patient import Patient
 from tumortrack.core.report import FitReport
 from tumortrack.core.types import FIRST_TUMOR, ORGAN
-from tumortrack.imaging.case import Case, load_case
-from tumortrack.imaging.segmentation_files import segments, write_dicom_seg, write_seg_nrrd
-from tumortrack.tracking.files import CENTRES, CT, MARGIN, read_report
+from tumortrack.io.case import Case, load_case
+from tumortrack.io.mesh_files import write_mesh
+from tumortrack.io.run_folder import CENTRES, CT, MARGIN, read_report
+from tumortrack.io.segmentation_files import segments, write_dicom_seg, write_seg_nrrd
 from tumortrack.tracking.options import ExportOptions
 
 _SCHEMA = (

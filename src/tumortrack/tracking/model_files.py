@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
+from tumortrack.assessment.bound_factor import read_factor
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError, PackageError, StorageError
 from tumortrack.core.organ import Organ, organ_entry
 from tumortrack.core.types import part_names
-from tumortrack.imaging.case import Case, holds_case, load_case
-from tumortrack.models.folder import (
+from tumortrack.io.case import Case, holds_case, load_case
+from tumortrack.io.model_folder import (
     KIND,
     has_shape,
     is_finished,
@@ -24,11 +25,10 @@ from tumortrack.models.folder import (
     read_model_manifest,
     save_model,
 )
-from tumortrack.models.in_distribution import InDistributionRange
-from tumortrack.models.method import method_of_folder
-from tumortrack.models.model import Model
+from tumortrack.registration.base_model import Model
+from tumortrack.registration.in_distribution import InDistributionRange
+from tumortrack.registration.method import method_of_folder
 from tumortrack.registration.model import RegistrationModel
-from tumortrack.tracking.bound_factor import read_factor
 from tumortrack.tracking.presets import clinic, seen_by
 
 if TYPE_CHECKING:

@@ -14,9 +14,9 @@ from tumortrack.core.patient import UNKNOWN, Patient
 
 if TYPE_CHECKING:
     from tumortrack.core.types import DepthError
-    from tumortrack.models.model import Model
-    from tumortrack.sense.region import RegionConfig
-    from tumortrack.simulate.scene import SceneConfig
+    from tumortrack.registration.base_model import Model
+    from tumortrack.segmentation import RegionConfig
+    from tumortrack.simulation.scene import SceneConfig
 
 Device = Literal["auto", "cpu", "cuda"]
 # ``sense.noise.SENSORS``, and the cameras of sense/sensors.toml.
@@ -72,7 +72,7 @@ class RegionOptions(PatientOptions):
         """Raises InputError: it is neither mm nor a camera."""
         if self.depth_error == "":
             return None
-        from tumortrack.sense.sensors import depth_error_of
+        from tumortrack.simulation.sensors import depth_error_of
 
         return depth_error_of(self.depth_error)
 
@@ -246,12 +246,12 @@ class SimulateOptions:
             raise InputError(f"--scenes {self.scenes} must be at least 1.")
 
     def scene_config(self) -> SceneConfig:
-        from tumortrack.sense.cloud import CloudConfig
-        from tumortrack.sense.noise import CLEAN
-        from tumortrack.sense.sensors import simulated
-        from tumortrack.simulate import deform
-        from tumortrack.simulate.deform.drag import CONFIGURATIONS
-        from tumortrack.simulate.scene import PoseConfig, SceneConfig
+        from tumortrack.core.cloud import CloudConfig
+        from tumortrack.simulation import deform
+        from tumortrack.simulation.deform.drag import CONFIGURATIONS
+        from tumortrack.simulation.noise import CLEAN
+        from tumortrack.simulation.scene import PoseConfig, SceneConfig
+        from tumortrack.simulation.sensors import simulated
 
         models: list[deform.DragConfig | deform.ElasticConfig] = [deform.ElasticConfig()]
         if not self.elastic:
@@ -302,8 +302,8 @@ def model_folder(
     """A given model's folder, or that of the model in a given case. A missing one is made, within
     ``making()``, which yields the ``progress`` of ``case_model``. Raises as ``load_case`` and
     ``case_model`` do."""
-    from tumortrack.imaging.case import Case, holds_case, load_case
-    from tumortrack.models.folder import is_model_of
+    from tumortrack.io.case import Case, holds_case, load_case
+    from tumortrack.io.model_folder import is_model_of
 
     if not holds_case(given):
         return given

@@ -8,10 +8,10 @@ import msgspec
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy
-from tumortrack.models.method import Preset, method_of_preset
-from tumortrack.models.model import ModelConfig
+from tumortrack.registration.base_model import ModelConfig
 from tumortrack.registration.config import Rotations, clinic
-from tumortrack.sense.noise import CLEAN, SENSORS, Sensor
+from tumortrack.registration.method import Preset, method_of_preset
+from tumortrack.simulation.noise import CLEAN, SENSORS, Sensor
 
 C = TypeVar("C", bound=ModelConfig)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,29 +12,27 @@ import msgspec
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.assessment.advice import next_evidence, part_number
-from tumortrack.assessment.causes import causes_of, check_of, explained, words
-from tumortrack.assessment.verdict import Disputes, judged, timed
-from tumortrack.core.assessment import Assessment
+from tumortrack.assessment.advice import part_number
+from tumortrack.assessment.causes import causes_of, check_of, words
+from tumortrack.assessment.verdict import Advise, Disputes, assessed, judged
+from tumortrack.core.cloud import CloudConfig
 from tumortrack.core.config import Config, check_seed
 from tumortrack.core.errors import InputError, NoEstimate, NotThisOrgan
 from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.evidence import CAMERA, Evidence, touched
 from tumortrack.core.geometry import HERE, Affine, rigid, transform_points
 from tumortrack.core.process import keep_small_blocks
-from tumortrack.core.report import Finding, Likely, NextEvidence
+from tumortrack.core.report import Likely
 from tumortrack.core.types import Anatomy, DepthFrame, Look, SensorCloud
-from tumortrack.imaging.case import Case
-from tumortrack.models.folder import weakness_of
-from tumortrack.models.method import Locator, method_of_config
-from tumortrack.models.model import Model
+from tumortrack.io.case import Case
+from tumortrack.registration.base_model import Model
 from tumortrack.registration.evidence import EvidenceTerms
 from tumortrack.registration.locator import RegistrationLocator
+from tumortrack.registration.method import Locator, method_of_config
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion, seen_from_first
-from tumortrack.sense.cloud import CloudConfig
-from tumortrack.sense.region import RegionConfig
-from tumortrack.sense.smoothing import clean_cloud
+from tumortrack.segmentation import RegionConfig
+from tumortrack.segmentation.smoothing import clean_cloud
 from tumortrack.tracking.model_files import case_model
 from tumortrack.tracking.pieces import likeliest_piece
 
@@ -71,9 +68,7 @@ class Tracker:
                 "Tracker(load_case(FOLDER))."
             )
         keep_small_blocks()
-        self.model, self._patient, self._organ = model, model.patient, model.organ
-        self._weakness = weakness_of(model.provenance)
-        self._locator = _locator(model)
+        self.model, self._locator = model, _locator(model)
         if advise and not isinstance(model, RegistrationModel):
             raise InputError("advice needs a model that knows a motion: give the case itself.")
         self._advised = part_number(advise, model.parts) if advise else None
@@ -154,7 +149,7 @@ class Tracker:
 
         with self._explaining_errors(looks, _DEFAULTS, bool(pieces)):
             estimate, looks = likeliest_piece(looks, located)
-        return self._assessed(estimate, looks, _DEFAULTS, whole=True)
+        return assessed(estimate, looks, self.model, advise="all", part=self._advised)
 
     def follow(
         self,
@@ -180,37 +175,8 @@ class Tracker:
 
         with self._explaining_errors(looks, how, bool(pieces or (last and last.evidence))):
             estimate, looks = likeliest_piece(looks, located, most=1)  # a frame may not wait
-        return self._assessed(estimate, looks, how)
-
-    def _assessed(
-        self, estimate: Estimate, looks: Sequence[Look], how: FollowOptions, whole: bool = False
-    ) -> Estimate:
-        """The estimate with whose it is, the causes if it is poor, and what to learn next.
-        ``whole``: of a cloud alone, and no frame of many."""
-        start_s, report, assessment = time.perf_counter(), estimate.report, estimate.assessment
-        finding, causes, advice = assessment.finding, tuple[Likely, ...](), ""
-        if self._weakness:
-            finding = Finding("model", {"words": self._weakness})
-        elif finding is not None:
-            causes, advice = explained(self.model, looks, estimate, how.known)
-        pays = tuple[NextEvidence, ...]()
-        if isinstance(self.model, RegistrationModel) and (whole or how.thorough):
-            config = self.model.config.refine
-            pays = next_evidence(estimate, self._advised, config, touches_only=not whole)
-        return replace(
-            estimate,
-            assessment=Assessment(
-                bounds=assessment.bounds,
-                factor=assessment.factor,
-                finding=finding,
-                causes=causes,
-                advice=advice,
-                next_evidence=pays,
-            ),
-            report=msgspec.structs.replace(report, timings=timed(report, "explain", start_s)),
-            patient=self._patient,
-            organ=self._organ,
-        )
+        advise: Advise = "touches" if how.thorough else "nothing"
+        return assessed(estimate, looks, self.model, how.known, advise, self._advised)
 
     @contextmanager
     def _explaining_errors(

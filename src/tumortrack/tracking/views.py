@@ -10,19 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from tumortrack.core.camera import deproject_pixels, with_depth_error
+from tumortrack.core.cloud import check_cloud, check_depth_unit, crop_cloud
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import Affine
 from tumortrack.core.store import read_json
 from tumortrack.core.types import DepthFrame, Look, PointNoise, SensorCloud
-from tumortrack.models.model import Model
-from tumortrack.registration.gauss_newton import FARTHEST
-from tumortrack.registration.looks import kernel_width_mm, lies_on
-from tumortrack.registration.model import RegistrationModel
-from tumortrack.registration.motion import ElasticMotion, seen_from_first
-from tumortrack.sense.camera import deproject_pixels, with_depth_error
-from tumortrack.sense.cloud import check_cloud, check_depth_unit, crop_cloud
-from tumortrack.sense.files import (
+from tumortrack.io.depth_files import (
     CLOUD_SUFFIXES,
     DEPTH_SUFFIXES,
     read_cloud,
@@ -30,9 +25,14 @@ from tumortrack.sense.files import (
     read_mask,
     read_poses,
 )
-from tumortrack.sense.measured_noise import noise_of
-from tumortrack.sense.region import Hints, organ_points
-from tumortrack.sense.region.working_image import ORGAN, PIECES, STEPS, THIN, image_of_frame
+from tumortrack.registration.base_model import Model
+from tumortrack.registration.gauss_newton import FARTHEST
+from tumortrack.registration.looks import kernel_width_mm, lies_on
+from tumortrack.registration.model import RegistrationModel
+from tumortrack.registration.motion import ElasticMotion, seen_from_first
+from tumortrack.segmentation import Hints, organ_points
+from tumortrack.segmentation.measured_noise import noise_of
+from tumortrack.segmentation.working_image import ORGAN, PIECES, STEPS, THIN, image_of_frame
 from tumortrack.tracking.options import LocateOptions
 
 NO_CLOUD = Path("-")

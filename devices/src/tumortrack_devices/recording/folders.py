@@ -11,12 +11,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.mesh_files import read_anatomy
 from tumortrack.core.store import natural, read_json
 from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.io import depth_files as files
+from tumortrack.io.mesh_files import read_anatomy
+from tumortrack.io.scene_folder import organ_of_folder
 from tumortrack.live.values import Observation
-from tumortrack.sense import files
-from tumortrack.simulate.scene_folder import organ_of_folder
 
 INTRINSICS, DEPTH, CLOUD, META = "intrinsics.json", "depth.png", "cloud.ply", "meta.json"
 ABOUT = "recording.json"  # of the sink ``recording``

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from tumortrack.core.camera import plausible
+from tumortrack.core.cloud import seen_points
 from tumortrack.core.errors import InputError, readable
 from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud
+from tumortrack.core.units import depths_mm
 from tumortrack.live.values import Observation
-from tumortrack.sense.camera import plausible
-from tumortrack.sense.cloud import seen_points
-from tumortrack.sense.units import depths_mm
 from tumortrack_devices.ros.messages import MM_PER_M, Messages, Outgoing, stamp_of
 
 CLOUD = "sensor_msgs/msg/PointCloud2"

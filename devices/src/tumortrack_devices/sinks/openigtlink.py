@@ -18,8 +18,8 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, transform_points
 from tumortrack.core.mesh_query import rough_margin
 from tumortrack.core.types import Mesh
+from tumortrack.io.run_folder import CENTRES, CT, MARGIN
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
-from tumortrack.tracking.files import CENTRES, CT, MARGIN
 from tumortrack_devices.beside import Beside
 from tumortrack_devices.igtl import message as igtl
 from tumortrack_devices.igtl.link import Link

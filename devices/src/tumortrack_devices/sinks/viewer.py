@@ -23,9 +23,9 @@ from tumortrack.core.estimate import Motion
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.packages import to_install
 from tumortrack.core.types import Mesh
-from tumortrack.imaging.case import load_case
+from tumortrack.io.case import load_case
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
-from tumortrack.tracking.slices import CarriedCt, SlicePlane, outlined, plane_through
+from tumortrack.report.slices import CarriedCt, SlicePlane, outlined, plane_through
 from tumortrack_devices.display import seen_points
 from tumortrack_devices.viewer.look import point_under
 from tumortrack_devices.viewer.panel import ABORTED, Panel, State, StatusPanel

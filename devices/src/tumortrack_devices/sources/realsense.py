@@ -17,12 +17,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from tumortrack.core.camera import plausible
 from tumortrack.core.errors import InputError
 from tumortrack.core.packages import to_install
 from tumortrack.core.types import DepthFrame, Intrinsics
+from tumortrack.core.units import depths_mm
 from tumortrack.live.values import Observation, SourceConfig, SourceEnded, SourceLost
-from tumortrack.sense.camera import plausible
-from tumortrack.sense.units import depths_mm
 
 _RECORDINGS = (".db3", ".bag")
 _LAST_S = 0.2  # after a recording's end, for its last frame

@@ -63,9 +63,9 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
     def player(self) -> ScenePlayer:
         """The simulated room; building it takes some seconds. Raises ArtifactError if there is no
         case, or no states of it, InputError if case or options make no scene."""
-        from tumortrack.imaging.case import load_case
-        from tumortrack.sense.noise import CLEAN
-        from tumortrack.sense.sensors import simulated
+        from tumortrack.io.case import load_case
+        from tumortrack.simulation.noise import CLEAN
+        from tumortrack.simulation.sensors import simulated
         from tumortrack_devices.player import ScenePlayer, ScenePlayerConfig
         from tumortrack_devices.pulled import PulledStates
 

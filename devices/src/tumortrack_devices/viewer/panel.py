@@ -16,7 +16,7 @@ from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED
 from tumortrack.core.patient import NOBODY
 from tumortrack.core.report import FitReport
 from tumortrack.live.values import Controls, TrackingResult, Workcell
-from tumortrack.tracking.slices import ORIENTATIONS
+from tumortrack.report.slices import ORIENTATIONS
 from tumortrack_devices.viewer.look import View
 from tumortrack_devices.viewer.scene import DisplayOptions
 

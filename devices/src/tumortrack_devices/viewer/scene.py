@@ -20,7 +20,7 @@ from tumortrack.core.mesh_query import exact_margin, rough_margin, surface_dista
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.live import values as live
 from tumortrack.live.values import TrackingResult, TransformedEstimate
-from tumortrack.tracking.slices import SlicePlane
+from tumortrack.report.slices import SlicePlane
 from tumortrack_devices.beside import Beside
 from tumortrack_devices.display import MOST_SEEN, seen_colours, seen_points, thinned, wxyz_of
 from tumortrack_devices.viewer.look import Viewpoint

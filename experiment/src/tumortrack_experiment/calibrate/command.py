@@ -93,7 +93,7 @@ class CalibrateCamera(WithBoard):
         import numpy as np
 
         from tumortrack.core.config import to_builtins
-        from tumortrack.sense.files import intrinsics_json
+        from tumortrack.io.depth_files import intrinsics_json
         from tumortrack_experiment.calibrate.depth import correction, depth_report
         from tumortrack_experiment.calibrate.lens import fit_lens, lens_of, rays_apart
         from tumortrack_experiment.calibrate.report import camera_words, draw_camera

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame
-from tumortrack.sense.noise import REFERENCE_MM, CalibrationConfig
+from tumortrack.simulation.noise import REFERENCE_MM, CalibrationConfig
 from tumortrack_experiment.calibrate.board import Corners
 from tumortrack_experiment.calibrate.lens import Lens, pixel_rays
 

@@ -11,13 +11,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float64
 
+from tumortrack.core.camera import plausible
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Affine, rigid
 from tumortrack.core.store import read_json
 from tumortrack.core.types import Intrinsics
-from tumortrack.sense.camera import plausible
-from tumortrack.sense.files import read_intrinsics
+from tumortrack.io.depth_files import read_intrinsics
 from tumortrack_experiment.calibrate.board import Corners
 
 _NO_RADIAL = cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3

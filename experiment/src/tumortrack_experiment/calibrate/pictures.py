@@ -18,9 +18,9 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import Affine, read_rigid
 from tumortrack.core.store import natural, read_file, read_json
 from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.io.depth_files import read_depth_png
 from tumortrack.live.poses import FilePoses
 from tumortrack.live.values import Observation
-from tumortrack.sense.files import read_depth_png
 from tumortrack_devices.recording.folders import ABOUT, DEPTH, INTRINSICS, META
 from tumortrack_experiment.record.read import read_recorded
 

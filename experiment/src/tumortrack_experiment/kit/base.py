@@ -17,10 +17,10 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import DIRECTIONS_LPS as WAYS
 from tumortrack.core.geometry import Direction, rigid, rotation_onto, transform_points
+from tumortrack.core.render import Visibility
 from tumortrack.core.solids import mesh_of
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.report.renderer import ParallelView
-from tumortrack.sense.render import Visibility
 from tumortrack_experiment.kit import stands
 from tumortrack_experiment.kit.solids import box, cone, height_field, rounded_plate, written
 from tumortrack_experiment.kit.values import PrintedPart

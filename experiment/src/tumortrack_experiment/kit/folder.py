@@ -9,7 +9,7 @@ import numpy as np
 
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
-from tumortrack.core.mesh_files import write_mesh
+from tumortrack.io.mesh_files import write_mesh
 from tumortrack_experiment.kit.design import Design
 from tumortrack_experiment.kit.sheet import write_sheet
 from tumortrack_experiment.kit.split import laid_mesh

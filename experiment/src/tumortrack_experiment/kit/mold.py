@@ -9,9 +9,9 @@ from jaxtyping import Float64
 
 from tumortrack.core.config import Config
 from tumortrack.core.geometry import transform_points, triangles_of
+from tumortrack.core.render import Visibility
 from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.sense.render import Visibility
 from tumortrack_experiment.kit.casting import Layout, cut_halves, lay_out
 from tumortrack_experiment.kit.mold_checks import cast_error, demould, open_edges, walls
 from tumortrack_experiment.kit.parting import undercut

@@ -17,9 +17,9 @@ from jaxtyping import Bool, Float, Float64, Real
 from scipy import ndimage
 
 from tumortrack.core.geometry import perpendicular, triangles_of, unit
+from tumortrack.core.raster import voxelise
+from tumortrack.core.render import Visibility
 from tumortrack.core.types import Mesh
-from tumortrack.imaging.raster import voxelise
-from tumortrack.sense.render import Visibility
 
 _FAR_MM = 50_000.0  # an eye from where the organ is seen as good as in parallel
 _GRAZED_MM = 0.05  # a wall along the pull is seen past itself

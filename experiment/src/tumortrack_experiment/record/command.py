@@ -59,8 +59,8 @@ class Record:
 
     def run(self) -> None:
         """Until all states are recorded, or the user ends it."""
+        from tumortrack.io.depth_files import read_camera
         from tumortrack.live.workers import SourceWorker
-        from tumortrack.sense.files import read_camera
         from tumortrack_experiment.kit_file import KIT_FILE, kit_path, read_kit
         from tumortrack_experiment.record.folder import RecordingFolder
         from tumortrack_experiment.record.guide import Guide, GuideConfig

@@ -10,17 +10,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from tumortrack.cli.console import say
+from tumortrack.core.cloud import CloudConfig
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import Affine
 from tumortrack.core.types import DepthFrame, Intrinsics
+from tumortrack.io.depth_files import DepthCorrection
 from tumortrack.live.cameras import CameraSetup
 from tumortrack.live.values import Observation, SourceLost
 from tumortrack.live.views import FrameCheck
 from tumortrack.live.workers import OPENING_S, SourceWorker
-from tumortrack.sense.cloud import CloudConfig
-from tumortrack.sense.files import DepthCorrection
-from tumortrack.sense.region import RegionConfig
+from tumortrack.segmentation import RegionConfig
 from tumortrack_experiment.kit_file import Kit
 from tumortrack_experiment.record.folder import RecordingFolder
 from tumortrack_experiment.record.quality import DepthMeter

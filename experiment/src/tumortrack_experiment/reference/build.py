@@ -12,10 +12,10 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.mesh_query import contains
-from tumortrack.imaging.case import Case
-from tumortrack.imaging.volume import read_volume
-from tumortrack.simulate.scene_folder import Scene, Targets
-from tumortrack.tracking.points import read_points
+from tumortrack.io.case import Case
+from tumortrack.io.points import read_points
+from tumortrack.io.scene_folder import Scene, Targets
+from tumortrack.io.volume import read_volume
 from tumortrack_experiment.kit_file import Kit, case_of_kit, kit_path, read_kit
 from tumortrack_experiment.record.read import Moment, Recorded
 from tumortrack_experiment.reference import scenes

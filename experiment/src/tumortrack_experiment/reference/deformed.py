@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from tumortrack.case.hu_windows import segment_ct
+from tumortrack.case.surface import surfaces
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm, transform_points
-from tumortrack.core.mesh_files import read_mesh
+from tumortrack.core.grid import grown_box, moved_origin, voxel_ml
+from tumortrack.core.raster import voxelise
 from tumortrack.core.types import Anatomy, Mesh, Volume
-from tumortrack.imaging.case import Case
-from tumortrack.imaging.grid import grown_box, moved_origin, voxel_ml
-from tumortrack.imaging.hu_windows import segment_ct
-from tumortrack.imaging.raster import voxelise
-from tumortrack.imaging.surface import surfaces
+from tumortrack.io.case import Case
+from tumortrack.io.mesh_files import read_mesh
 from tumortrack_experiment.kit_file import Kit
 from tumortrack_experiment.register.in_ct import Ball
 

@@ -8,15 +8,15 @@ from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
+from tumortrack.core.camera import deproject, project
+from tumortrack.core.cloud import CloudConfig, cloud_from_depth
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points, transform_points
 from tumortrack.core.mesh_query import labels_of
+from tumortrack.core.render import render_depth
 from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
-from tumortrack.imaging.case import Case
-from tumortrack.sense.camera import deproject, project
-from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
-from tumortrack.sense.render import render_depth
-from tumortrack.simulate.scene_folder import Targets
+from tumortrack.io.case import Case
+from tumortrack.io.scene_folder import Targets
 from tumortrack_experiment.register.beads import fit_rigid
 
 _PART_MM = 2.0  # a pixel so near to a part of the kit shows that

@@ -12,10 +12,10 @@ from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points, transform_points
-from tumortrack.imaging.volume import read_volume
+from tumortrack.io.depth_files import read_depth_png
+from tumortrack.io.points import read_points
+from tumortrack.io.volume import read_volume
 from tumortrack.live.calibration_file import CalibrationFile
-from tumortrack.sense.files import read_depth_png
-from tumortrack.tracking.points import read_points
 from tumortrack_experiment.kit_file import Kit, case_of_kit, kit_path, read_kit
 from tumortrack_experiment.record.read import Moment
 from tumortrack_experiment.register.beads import (

@@ -13,7 +13,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.store import natural
 from tumortrack.core.types import DepthFrame
-from tumortrack.sense.files import read_depth_png
+from tumortrack.io.depth_files import read_depth_png
 from tumortrack_devices.recording.folders import folder_frames
 from tumortrack_experiment.kit_file import KIT_FILE, Kit
 from tumortrack_experiment.record.read import Moment, Recorded, read_recorded

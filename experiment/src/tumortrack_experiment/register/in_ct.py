@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm, transform_points
+from tumortrack.core.grid import Box, extent_mm, grown_box
 from tumortrack.core.types import Volume
-from tumortrack.imaging.grid import Box, extent_mm, grown_box
 
 # Glass beads have 1,500 HU and more, ceramics and steel reach the scanner's last number (3071);
 # whatever else is on the base, tumors (to 1000 HU) and prints (about 100), has less.

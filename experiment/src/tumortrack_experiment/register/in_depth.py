@@ -7,10 +7,10 @@ from jaxtyping import Float, Float64
 from scipy import ndimage
 from scipy.optimize import least_squares
 
+from tumortrack.core.camera import project
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points
 from tumortrack.core.types import DepthFrame
-from tumortrack.sense.camera import project
 
 _CELL_MM = 1.0  # of the votes for a ball's middle
 _NORMAL_MM = 2.0  # window over which a normal is taken

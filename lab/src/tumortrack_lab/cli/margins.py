@@ -39,8 +39,8 @@ class Margins:
 
     def run(self) -> None:
         """Raises InputError: scenes that can't be used, or too few of them."""
-        from tumortrack.models.folder import read_model_manifest
-        from tumortrack.tracking.bound_factor import NAME, write_factor
+        from tumortrack.assessment.bound_factor import NAME, write_factor
+        from tumortrack.io.model_folder import read_model_manifest
         from tumortrack_lab.margins import LEAST, found_factor, list_states
 
         check_seed(self.seed)
@@ -67,8 +67,8 @@ def located(
 ) -> list[Row]:
     """The rows of every state, located with the model of this folder; those in the table are not
     located again. Raises InputError: a scene was changed since then."""
+    from tumortrack.io.scene_folder import read_scene
     from tumortrack.report.protocol import check_case
-    from tumortrack.simulate.scene_folder import read_scene
     from tumortrack.tracking.model_files import load_model
     from tumortrack.tracking.tracker import Tracker
     from tumortrack_lab.margins import Locating, head_of, open_table

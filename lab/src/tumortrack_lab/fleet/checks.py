@@ -14,9 +14,9 @@ from tumortrack.core.mesh_query import surface_samples
 from tumortrack.core.organ import KIDNEY
 from tumortrack.core.patient import UNKNOWN
 from tumortrack.core.types import Mesh
-from tumortrack.imaging.case import Case
-from tumortrack.imaging.volume import read_raw
-from tumortrack.registration.rest_shape import long_axis_mm
+from tumortrack.io.case import Case
+from tumortrack.io.volume import read_raw
+from tumortrack.organ.rest_shape import long_axis_mm
 from tumortrack.report.metrics import distance_to_surface
 
 _ORGAN_AT_ALL_ML = {True: (30.0, 1500.0), False: (10.0, 4000.0)}  # a kidney, another

@@ -11,9 +11,9 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
+from tumortrack.case.options import PrepareOptions
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
-from tumortrack.imaging.options import PrepareOptions
 from tumortrack_lab.fleet.run import File
 
 _LARGEST = 64 * 2**20  # bytes

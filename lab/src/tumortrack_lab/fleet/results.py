@@ -82,13 +82,13 @@ def write_results(
 def reasons_to_look(row: Mapping[str, Any]) -> list[str]:
     """Why a person should look at a patient."""
     if row["state"] in ("cannot", "failed"):
-        return [f"{row['step']}: {row['reason']}"]
+        return [f"{row['step'] or row['state']}: {row['reason']}"]
     if row["state"] == "open":
         return []
     reasons = list(row["doubts"].split("\n")) if row["doubts"] else []
     without = row["poor"] + row["refused"]
     if row["scenes"] == 0:
-        reasons.append("no state of the twin could be made")
+        reasons.append("no state could be made")
     elif without > _MOST_WITHOUT:
         reasons.append(f"{without:.0%} of {row['scenes']} scenes without a good answer")
     if row["over_5_mm"]:

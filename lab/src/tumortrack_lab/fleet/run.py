@@ -182,7 +182,7 @@ def on_ray(
 
     try:
         ray.init(log_to_driver=False, logging_level=logging.ERROR, **options)
-    except (ConnectionError, RuntimeError, ValueError, OSError) as error:
+    except Exception as error:  # of any kind: Ray raises them so
         where = f"the Ray cluster at {address}" if address else "Ray on this machine"
         words = str(error).strip().splitlines()[0]
         raise InputError(f"{where} cannot be used: {words}") from error

@@ -17,18 +17,18 @@ import msgspec
 import numpy as np
 from PIL import Image
 
+from tumortrack.assessment.bound_factor import NAME, write_factor
+from tumortrack.assessment.fingerprint import fingerprint
+from tumortrack.case import prepare as preparing
+from tumortrack.case.options import PrepareOptions
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.rigid_fit import matched_vertices
-from tumortrack.imaging import prepare as preparing
-from tumortrack.imaging.case import Case, load_case, save_case
-from tumortrack.imaging.options import PrepareOptions
-from tumortrack.models.model import Model
+from tumortrack.io.case import Case, load_case, save_case
+from tumortrack.io.scene_folder import read_scene
+from tumortrack.registration.base_model import Model
 from tumortrack.report.pictures import qc_picture, scene_picture
 from tumortrack.report.protocol import evaluate_scene
-from tumortrack.simulate.scene_folder import read_scene
-from tumortrack.tracking.bound_factor import NAME, write_factor
-from tumortrack.tracking.fingerprint import fingerprint
 from tumortrack.tracking.model_files import case_model, load_model
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_lab.fleet import checks

@@ -15,9 +15,9 @@ import numpy as np
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, Intrinsics
+from tumortrack.io.depth_files import read_intrinsics
 from tumortrack.live.values import Observation, SourceConfig, SourceLost
-from tumortrack.sense.files import read_intrinsics
-from tumortrack.sense.noise import D405_NOISE, add_noise
+from tumortrack.simulation.noise import D405_NOISE, add_noise
 
 
 class BenchSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="rehearsal"):

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.mesh_query import contains, surface_distance
+from tumortrack.core.raster import label_grid
 from tumortrack.core.types import ORGAN, Anatomy, Mesh
-from tumortrack.imaging.raster import label_grid
 from tumortrack.native import F32, F64, kernel
 from tumortrack.report.metrics import distance_to_surface
 from tumortrack_resection.values import ResectionPlan

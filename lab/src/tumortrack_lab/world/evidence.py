@@ -22,7 +22,7 @@ from tumortrack.core.evidence import Evidence, Free, Held, Landmark, Outline, To
 from tumortrack.core.geometry import perpendicular, plane_section, triangles_of, turned_by, unit
 from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import Mesh
-from tumortrack.simulate.scene_folder import Scene, Targets
+from tumortrack.io.scene_folder import Scene, Targets
 
 Generator = np.random.Generator
 Points = Float[np.ndarray, "n 3"]

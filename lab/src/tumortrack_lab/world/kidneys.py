@@ -17,7 +17,7 @@ from skimage.measure import marching_cubes
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.organ import KIDNEY, Organ
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.phantom import digital
+from tumortrack.simulation.phantom import digital
 
 _STEP_MM = 2.0  # of the grid that surfaces are drawn from
 _MARGIN_MM = 6.0

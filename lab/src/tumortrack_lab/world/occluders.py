@@ -13,11 +13,11 @@ import numpy as np
 import trimesh
 from jaxtyping import Float64
 
+from tumortrack.core.camera import deproject
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rotation_onto
+from tumortrack.core.render import render_depth
 from tumortrack.core.types import DepthFrame, Mesh
-from tumortrack.sense.camera import deproject
-from tumortrack.sense.render import render_depth
 from tumortrack_lab.world.equilibrium import Rod
 
 _CLEARANCE_MM = 3.0  # between a shaft's tip and the organ, towards the camera

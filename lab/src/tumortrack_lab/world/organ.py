@@ -17,8 +17,8 @@ from scipy.sparse.csgraph import connected_components
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.mesh_query import surface_samples
+from tumortrack.core.raster import label_grid
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.imaging.raster import label_grid
 from tumortrack_lab.world.equilibrium import Points
 from tumortrack_lab.world.forces import Bed, Obstacle, Springs, Touch, rows_of
 from tumortrack_lab.world.solid import NeoHookeanSolid

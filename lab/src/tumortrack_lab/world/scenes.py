@@ -15,11 +15,11 @@ from tumortrack.core import store
 from tumortrack.core.config import Config
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.geometry import transform_points
-from tumortrack.core.mesh_files import write_anatomy
 from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Anatomy
-from tumortrack.imaging.case import Case, load_case
-from tumortrack.simulate.scene_folder import InnerPoints, Scene, Targets, draw_targets, list_scenes
+from tumortrack.io.case import Case, load_case
+from tumortrack.io.mesh_files import write_anatomy
+from tumortrack.io.scene_folder import InnerPoints, Scene, Targets, draw_targets, list_scenes
 from tumortrack_experiment.kit.base import laid_down as bench_from_ct
 from tumortrack_lab.world import segmentation
 from tumortrack_lab.world.families import FAMILIES, Deformed, solve

@@ -26,21 +26,16 @@ from jaxtyping import Bool, Float64
 from scipy.spatial import cKDTree
 
 from tumortrack.core import colours, store
+from tumortrack.core.camera import d405
+from tumortrack.core.cloud import CloudConfig, cloud_from_depth
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.geometry import rigid, transform_points, triangles_of
+from tumortrack.core.render import render_depth
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.imaging.case import load_case
+from tumortrack.io.case import load_case
+from tumortrack.io.scene_folder import TARGETS, Scene, draw_targets, write_scene_files
 from tumortrack.report.pictures import depth_picture, scene_views, write_sheet
-from tumortrack.sense.camera import d405
-from tumortrack.sense.cloud import CloudConfig, cloud_from_depth
-from tumortrack.sense.noise import D405_NOISE, add_noise
-from tumortrack.sense.render import render_depth
-from tumortrack.simulate.scene_folder import (
-    TARGETS,
-    Scene,
-    draw_targets,
-    write_scene_files,
-)
+from tumortrack.simulation.noise import D405_NOISE, add_noise
 from tumortrack_experiment.kit.base import laid_down as bench_from_ct
 from tumortrack_experiment.kit.stands import COMPRESSION_MM, poke_point
 from tumortrack_lab.scripting import claim, known

@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
+from tumortrack.core.camera import d405
+from tumortrack.core.cloud import CloudConfig
 from tumortrack.core.geometry import rigid, rotation_onto, transform_points, unit
+from tumortrack.core.render import render_depth
 from tumortrack.core.types import DepthFrame, Intrinsics, Mesh, SensorCloud
-from tumortrack.sense.camera import d405
-from tumortrack.sense.cloud import CloudConfig
-from tumortrack.sense.region import Hints, RegionConfig, organ_points
-from tumortrack.sense.render import render_depth
+from tumortrack.segmentation import Hints, RegionConfig, organ_points
 from tumortrack_lab.world.equilibrium import Rod
 from tumortrack_lab.world.families import Deformed, log_uniform
 from tumortrack_lab.world.noise import StereoCamera, StereoConfig

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int64, UInt8
 from tumortrack.core.errors import InputError
 from tumortrack.core.mesh_query import contains, labels_of, surface_distance
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.simulate.scene import OccupancyConfig
+from tumortrack.simulation.scene import OccupancyConfig
 
 Points = Float[np.ndarray, "n 3"]
 Labels = UInt8[np.ndarray, " n"]

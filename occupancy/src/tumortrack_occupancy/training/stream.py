@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float32, Num, UInt8
 
 from tumortrack.core.types import Anatomy
-from tumortrack.simulate.elastic.body import ElasticBody
-from tumortrack.simulate.scene import RenderedScene, SceneConfig, SceneRecipe, Simulator
+from tumortrack.organ.body import ElasticBody
+from tumortrack.simulation.scene import RenderedScene, SceneConfig, SceneRecipe, Simulator
 from tumortrack_occupancy.training.query_points import OccupancyPool
 
 

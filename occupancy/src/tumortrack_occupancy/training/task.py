@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Float64, UInt8
 
+from tumortrack.case.symmetry import ambiguous, half_turns
 from tumortrack.core.errors import NoEstimate
-from tumortrack.imaging.symmetry import ambiguous, half_turns
-from tumortrack.models.in_distribution import InDistributionRange, fit_mm, spread_mm
-from tumortrack.simulate.scene import SceneRecipe, Simulator, body_for
+from tumortrack.registration.in_distribution import InDistributionRange, fit_mm, spread_mm
+from tumortrack.simulation.scene import SceneRecipe, Simulator, body_for
 from tumortrack_occupancy.model import OccupancyModel
 from tumortrack_occupancy.network import Latent, OccupancyNetwork
 from tumortrack_occupancy.training.query_points import OccupancyPool

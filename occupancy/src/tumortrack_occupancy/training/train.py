@@ -21,8 +21,8 @@ import torch
 from tumortrack.core.errors import InputError, StorageError, TumortrackError
 from tumortrack.core.process import available_cores, keep_freed_memory
 from tumortrack.core.store import write_atomically, writing
-from tumortrack.models.folder import check_trainable, is_finished, read_model_manifest, save_model
-from tumortrack.models.method import TrainingStatus
+from tumortrack.io.model_folder import check_trainable, is_finished, read_model_manifest, save_model
+from tumortrack.registration.method import TrainingStatus
 from tumortrack.tracking.model_files import load_model
 from tumortrack_occupancy.hardware import choose_device
 from tumortrack_occupancy.model import OccupancyModel

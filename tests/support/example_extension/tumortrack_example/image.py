@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import ClassVar
 
 from tumortrack.core.types import DepthFrame
+from tumortrack.io.depth_files import read_depth_png
 from tumortrack.live.values import Observation, SourceConfig, SourceLost
-from tumortrack.sense.files import read_depth_png
 
 
 class ImageSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="image"):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tumortrack.core.config import Config
-from tumortrack.simulate.deform.base import Points, View
+from tumortrack.simulation.deform.base import Points, View
 
 
 @dataclass(frozen=True)
