@@ -96,7 +96,7 @@ site: setup  ## the documentation's site, strictly: build/site/index.html (`.ven
 test: check site pytest  ## check, then the tests of all distributions (those of Chromium and Fast DDS after `make debian`, of others' programs after `make clients`)
 
 quick: setup  ## the quickest tests of the tracker (a minute)
-	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2 -m 'not slow' tests/core tests/sense/test_render.py
+	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2 -m 'not slow' tests/core
 
 pythons:  ## a fresh clone with every Python here: install, short demo, doctor, quick tests (ARGS=/usr/bin/python3)
 	tools/pythons.sh $(ARGS)

@@ -18,8 +18,8 @@ ROOT = Path(__file__).parents[2]
 TESTS = (
     "tests/native/test_native.py",
     "tests/core/test_mesh_kernels.py",
-    "tests/sense/test_render.py",
-    "tests/sense/test_sense_kernels.py",
+    "tests/core/test_render.py",
+    "tests/core/test_sense_kernels.py",
     "tests/report/test_renderer_kernels.py",
     "tests/registration/test_bend.py",
     "occupancy/tests/test_lattice_kernels.py",
