@@ -180,7 +180,7 @@ def draw(frame: pd.DataFrame, path: Path) -> None:
 @dataclass(frozen=True)
 class Condition:
     """``kind``: white, correlated, cloud (mm of white noise), strays or fat (% of the points), or a
-    camera of ``sense.sensors``; ``amount``: mm, %, or so many times a camera's noise (0: its edges,
+    camera of ``simulation.sensors``; ``amount``: mm, %, or so many times a camera's noise (0: its edges,
     holes and steps alone); ``length_px``: where the correlation is 1/e; ``distance_mm``: the median
     of the organ's depths. Calibrated, and stated, but ``scale`` (%) and ``depth`` (mm), by which
     depths err to either side, and ``uncalibrated`` cameras, of which the kind is said."""

@@ -1,4 +1,4 @@
-"""Cases and scenes, and what is in any folder: `prepare`, `export`, `simulate`, `evaluate`,
+"""Cases and scenes, and what is in any folder: `prepare`, `export`, `simulation`, `evaluate`,
 `inspect`."""
 
 from __future__ import annotations

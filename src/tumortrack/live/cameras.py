@@ -22,7 +22,7 @@ from tumortrack.live.workers import SourceWorker
 
 # Frames so far apart go together: free-running cameras of 30 Hz are up to 17 ms apart, and an organ
 # that is pushed at 50 mm/s moves by 1 mm, one standard deviation of where a camera stands
-# (``sense.noise.CAMERA_STD``).
+# (``simulation.noise.CAMERA_STD``).
 TOGETHER_NS = 20_000_000
 _FIRST_S = 2.0  # for a camera's first frame
 _READ_S = 60.0  # for one that is made or read on demand: it comes, or the source ends

@@ -19,7 +19,7 @@ from tumortrack.io.csv_tables import read_rows, whole_in
 from tumortrack.live.values import Observation
 
 # Between two poses an arm that accelerates by 1 m/s2 deviates from linear interpolation by at most
-# a t^2 / 8 = 1.3 mm, about the tolerance of a camera's place (``sense.noise.CAMERA_STD``).
+# a t^2 / 8 = 1.3 mm, about the tolerance of a camera's place (``simulation.noise.CAMERA_STD``).
 _GAP_NS = 100_000_000
 _BACK_NS = 1_000_000_000
 _KEPT = 2000  # poses of a live source: 4 s at 500 Hz

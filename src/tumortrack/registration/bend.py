@@ -1,6 +1,6 @@
 """The fit goes on in the body's compliance: what no state of the library can follow.
 
-Forces anywhere on the surface displace it (``simulate.elastic.modes.compliance_modes``), by
+Forces anywhere on the surface displace it (``organ.modes.compliance_modes``), by
 independent coefficients of one standard deviation. Each frame chooses it, and how far states
 spread, by marginal likelihood (Laplace's approximation), so that an organ that is as the library
 has it stays so.

@@ -9,7 +9,7 @@
 4. Choose (`likeliest`, below): by cost, and by how the organ may lie, which the case says. Other
    minima that explain the points nearly as well, and put a tumor elsewhere, are kept as rivals; one
    that explains them better in a pose that the case excludes makes the answer poor.
-5. Verdict (`models.in_distribution`): what cannot be this organ is refused.
+5. Verdict (`registration.in_distribution`): what cannot be this organ is refused.
 6. Bend (`bend`): what the library's states cannot follow, the body's compliance does; with it, what
    points and evidence leave open.
 

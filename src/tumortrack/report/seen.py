@@ -28,7 +28,7 @@ class Seen:
     Attributes:
         cloud: the organ's points, in which it was located.
         content: all that the camera saw.
-        taken: class of each pixel of a depth image (``sense.region.Region``); 0: the organ.
+        taken: class of each pixel of a depth image (``segmentation.Region``); 0: the organ.
         ct: for slices of the CT, moved to the organ; without it, slices show labels.
     """
 

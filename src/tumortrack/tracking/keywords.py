@@ -15,7 +15,7 @@ Box = tuple[float, float, float, float, float, float] | None
 
 
 class PrepareKeywords(TypedDict, total=False):
-    """See ``imaging.options.PrepareOptions``."""
+    """See ``case.options.PrepareOptions``."""
 
     organ_hu: tuple[float, float]
     tumor_hu: tuple[float, float]

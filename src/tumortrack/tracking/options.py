@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tumortrack.simulation.scene import SceneConfig
 
 Device = Literal["auto", "cpu", "cuda"]
-# ``sense.noise.SENSORS``, and the cameras of sense/sensors.toml.
+# ``simulation.noise.SENSORS``, and the cameras of simulation/sensors.toml.
 SimulatedSensor = Literal[
     "d405", "stereo", "d405-measured", "d435", "zed", "azure-kinect", "l515", "flexx2",
     "structured-light", "endoscope",
@@ -209,7 +209,7 @@ class ExportOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class SimulateOptions:
-    """Options of `simulate`.
+    """Options of `simulation`.
 
     Attributes:
         scenes: how many.

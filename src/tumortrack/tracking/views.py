@@ -126,7 +126,7 @@ class View:
 
 class OrganInView(NamedTuple):
     """The organ's points; an entry for the report on how they were chosen, with a sentence for
-    people as ``words``; and the class of each pixel (``sense.region.Region``). ``around``: how that
+    people as ``words``; and the class of each pixel (``segmentation.Region``). ``around``: how that
     sentence begins and ends."""
 
     cloud: SensorCloud

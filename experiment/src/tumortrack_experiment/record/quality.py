@@ -14,7 +14,7 @@ from tumortrack.live.values import Observation
 _PIXELS = 20_000  # that are looked at, evenly spread
 _WINDOW = 16  # frames: half a second at 30 Hz
 # A matcher that errs by 0.08 px, as RealSense's engineers advise, is 0.22 mm off at 150 mm
-# (``sense.noise``). Three times that is a reflecting, smooth or badly lit surface.
+# (``simulation.noise``). Three times that is a reflecting, smooth or badly lit surface.
 _REFERENCE_MM, _NOISE_MM = 150.0, 0.66
 _MOVED_MM = 1.0  # and more than noise would: a hand, an organ that still sinks
 _LEAST_MOVING = 0.005  # of all pixels; noise alone shifts less than one in a thousand

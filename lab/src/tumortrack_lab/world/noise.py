@@ -1,4 +1,4 @@
-"""A stereo camera's errors, a model that shares no code with ``sense.noise``: errors arise in
+"""A stereo camera's errors, a model that shares no code with ``simulation.noise``: errors arise in
 disparity and are correlated between near pixels and successive frames, rectification leaves some
 distortion, and wet tissue gives highlights.
 

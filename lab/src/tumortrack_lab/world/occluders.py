@@ -1,7 +1,7 @@
 """Other objects before the camera: instruments, fat, background.
 
 All act on the depth image of the organ (camera frame, mm), so that the cloud still comes from
-``sense.cloud``. Occluders count as segmented out: where they hide the organ there is no return.
+``core.cloud``. Occluders count as segmented out: where they hide the organ there is no return.
 Background is what a segmentation has left.
 """
 

@@ -1,4 +1,4 @@
-// The per-pixel work of ``sense.noise``. An organ fills a tenth of an image: kernels visit only the
+// The per-pixel work of ``simulation.noise``. An organ fills a tenth of an image: kernels visit only the
 // pixels with a return, which ``seen_pixels`` lists once, and change a list of their depths.
 //
 // Noise is hashed from (key, pixel) with SplitMix64 (Steele, Lea and Flood 2014,

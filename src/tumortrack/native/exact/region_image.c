@@ -1,4 +1,4 @@
-// See ``sense.region.working_image``.
+// See ``segmentation.working_image``.
 #include "native.h"
 
 // Removes, as the ``step`` that does it, what lies outside a box (camera frame, mm). ``across``,

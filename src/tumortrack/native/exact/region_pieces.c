@@ -1,4 +1,4 @@
-// See ``sense.region.pieces`` and ``sense.region.choose``. ``depth`` is in mm, ``taken`` is 0 where
+// See ``segmentation.pieces`` and ``segmentation.choose``. ``depth`` is in mm, ``taken`` is 0 where
 // no step has removed a pixel.
 #include "native.h"
 
@@ -220,7 +220,7 @@ static inline bool goes_on(
     return taken->at[place] == last_box && fabsf(depth->at[place] - z) < 5;  // mm: one surface
 }
 
-// Of each piece, as ``sense.region.choose._Sizes``; ``across``, ``down``, ``low`` and ``high`` are
+// Of each piece, as ``segmentation.choose._Sizes``; ``across``, ``down``, ``low`` and ``high`` are
 // sums of tangents and, along four directions of the image, ends (mm).
 struct piece {
     double area, pixels, across, down, border, disc, wide, cut, aside, low[4], high[4];

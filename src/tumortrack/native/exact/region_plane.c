@@ -1,4 +1,4 @@
-// See ``sense.region.plane``.
+// See ``segmentation.plane``.
 #include "native.h"
 
 static const double STEEPEST = 0.35;  // cosine of the largest angle between normal and optical axis

@@ -1,4 +1,4 @@
-// See ``sense.smoothing``.
+// See ``segmentation.smoothing``.
 #include "native.h"
 
 struct plane { double here, by_row, by_column; };

@@ -1,4 +1,4 @@
-// See ``simulate.elastic.flow``.
+// See ``organ.flow``.
 #include "fast/flow.h"
 
 struct count_steps {

@@ -1,4 +1,4 @@
-// Points that follow a velocity field on a lattice, in blocks; see ``simulate.elastic.flow``.
+// Points that follow a velocity field on a lattice, in blocks; see ``organ.flow``.
 #pragma once
 
 #include "native.h"
