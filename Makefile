@@ -76,10 +76,10 @@ check: setup  ## lint, types, import order, licences, figures in the pages
 	$(BIN)/python tools/dependencies.py licences
 	$(BIN)/python tools/figures.py --check
 
-debian:  ## install what tests need from Debian (Chromium, Fast DDS)
+debian:  ## install what tests need from Debian (Chromium, libusb, a compiler)
 	tools/debian.sh
 
-clients: $(TRACKER)  ## install other makers' programs that tests talk to (ROS 2's rclpy, ur_rtde, 3D Slicer's core: 1 GB); they have wheels of Python 3.11 on x86-64
+clients: $(TRACKER)  ## install other makers' programs that tests talk to (ROS 2's rclpy and Fast DDS, ur_rtde, 3D Slicer's core: 1 GB); they have wheels of Python 3.11 on x86-64
 	@if $(BIN)/python -c 'import platform, sys; sys.exit(sys.version_info[:2] != (3, 11) or platform.machine() != "x86_64")'; \
 	then $(MAKE) --no-print-directory $(CLIENTS); else echo "make clients: not Python 3.11 on x86-64; tests that need them skip"; fi
 
@@ -93,7 +93,7 @@ $(CLIENTS): requirements/clients.txt requirements/ur.txt
 site: setup  ## the documentation's site, strictly: build/site/index.html (`.venv/bin/mkdocs serve`: while you write)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-test: check site pytest  ## check, then the tests of all distributions (those of Chromium and Fast DDS after `make debian`, of others' programs after `make clients`)
+test: check site pytest  ## check, then the tests of all distributions (those of Chromium after `make debian`, of others' programs after `make clients`)
 
 quick: setup  ## the quickest tests of the tracker (a minute)
 	OMP_NUM_THREADS=1 $(BIN)/pytest -q -n 2 -m 'not slow' tests/core

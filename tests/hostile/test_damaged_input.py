@@ -317,12 +317,11 @@ def test_openigtlink(times):
         content, _ = igtl.unpack_body(igtl.Header(2, "X", "x", 0, len(data) - 1, 0), data[1:])
         unpack(content)
 
-    surface = igtl.Polydata(np.ones((3, 3)), np.array([[0, 1, 2]]))
     contents = (
         igtl.pack_transform(np.eye(4)),
         b"\0\3\0\1" + b"1",
         igtl.pack_points(np.ones((2, 3)), ["a", "b"], [(1, 2, 3)] * 2),
-        igtl.pack_polydata(surface),
+        igtl.pack_polydata(np.ones((3, 3)), np.array([[0, 1, 2]])),
     )
     bodies = [
         bytes([n]) + igtl.pack(igtl.Message("X", "x", 1, content, {"k": "v"}))[igtl.HEADER_SIZE :]

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from pydicom.dataelem import DataElement
 
 from hostile import NAN, Make, Room, attacks, check
 from raw_files import ball, nifti_header, nrrd, sphere
@@ -228,8 +229,9 @@ def tag(name: str, value: object, which: slice = EVERY) -> Make:
         for dataset in slices[which]:
             if value is None:
                 delattr(dataset, name)
-            elif value != value:  # NaN: pydicom takes none
-                dataset[name]._value = value
+            elif value != value:  # NaN: pydicom takes none that it would have to convert
+                tag, vr = dataset[name].tag, dataset[name].VR
+                dataset[name] = DataElement(tag, vr, value, already_converted=True)
             else:
                 setattr(dataset, name, value)
 

@@ -22,7 +22,7 @@ def texts(figure: Figure) -> list[Text]:
     legends = [text for legend in figure.legends for text in legend.get_texts()]
     titles = [title for axes in figure.axes for title in (axes.title, axes.yaxis.label)]
     every = [*figure.texts, *legends, *titles]
-    assert figure._suptitle is None  # it knows of no borders
+    assert not figure.get_suptitle()  # it knows of no borders
     return [text for text in every if text.get_text()]
 
 

@@ -47,7 +47,6 @@ _MODULES = {  # import names that differ from the package's
     "pillow": "PIL",
     "pin": "pinocchio",
     "python-gdcm": "gdcm",
-    "scikit-fem": "skfem",
     "scikit-image": "skimage",
     "ur_rtde": "rtde_control",
 }

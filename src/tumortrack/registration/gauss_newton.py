@@ -64,7 +64,8 @@ class _State(NamedTuple):
     gradient: np.ndarray  # (p,)
 
 
-_descend = kernel(  # problem, state, room, first and last step, what it ended with
+# Problem, state, room, first and last step, what it ended with.
+_descend = kernel(
     "descend",
     (MODES, F64[3], DISTANCES, F64["p", "p"], F64["m"], F32["n", 3], *[float] * 5),
     (F64[3, 3].out, F64[3].out, F64["m"].out, F64[6].out, F32["n"].out, F64["p", "p"].out,

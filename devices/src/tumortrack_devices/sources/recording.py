@@ -59,7 +59,7 @@ class RecordingSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="record
     def patient(self) -> Patient:
         if not self.path.exists():
             raise InputError(f"{self.path} does not exist, so it cannot be played.")
-        about = self._about
+        about = self.about
         return patient_in(read_json(about).get("patient"), str(about)) if about else NOBODY
 
     @classmethod
@@ -71,7 +71,7 @@ class RecordingSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="record
         files = [path] if path.is_file() else path.rglob("*")
         size_mb = sum(file.stat().st_size for file in files) / 2**20
         lines = [f"a recording of {seconds:.1f} s, {size_mb:.1f} MB"]
-        about = cls(path=path)._about
+        about = cls(path=path).about
         stated = read_json(about) if about else {}
         match stated.get("patient"):
             case {"id": name, "side": side} if name and side:
@@ -86,10 +86,10 @@ class RecordingSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="record
     @property
     def is_corrected(self) -> bool:
         """Whether the recording states that its depths are corrected."""
-        return self._about is not None and read_json(self._about).get("corrected") is True
+        return self.about is not None and read_json(self.about).get("corrected") is True
 
     @property
-    def _about(self) -> Path | None:
+    def about(self) -> Path | None:
         about = (self.path if self.path.is_dir() else self.path.parent) / ABOUT
         return about if about.is_file() else None
 
