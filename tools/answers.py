@@ -1,6 +1,6 @@
 """The answers that tools/replay.py compares: of clouds, images, evidence, frames and the rest.
 
-All are of the built-in phantom on coarse voxels, in scenes of `simulation` and of the virtual camera,
+All are of the built-in phantom on coarse voxels, in scenes of `simulate` and of the virtual camera,
 so that any machine makes the same ones (to about 1e-5 mm).
 """
 

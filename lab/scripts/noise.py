@@ -180,10 +180,10 @@ def draw(frame: pd.DataFrame, path: Path) -> None:
 @dataclass(frozen=True)
 class Condition:
     """``kind``: white, correlated, cloud (mm of white noise), strays or fat (% of the points), or a
-    camera of ``simulation.sensors``; ``amount``: mm, %, or so many times a camera's noise (0: its edges,
-    holes and steps alone); ``length_px``: where the correlation is 1/e; ``distance_mm``: the median
-    of the organ's depths. Calibrated, and stated, but ``scale`` (%) and ``depth`` (mm), by which
-    depths err to either side, and ``uncalibrated`` cameras, of which the kind is said."""
+    camera of ``simulation.sensors``; ``amount``: mm, %, or so many times a camera's noise (0: its
+    edges, holes and steps alone); ``length_px``: where the correlation is 1/e; ``distance_mm``: the
+    median of the organ's depths. Calibrated, and stated, but ``scale`` (%) and ``depth`` (mm), by
+    which depths err to either side, and ``uncalibrated`` cameras, of which the kind is said."""
 
     kind: str
     amount: float = 0.0

@@ -117,6 +117,6 @@ def test_each_condition_is_measured_once_and_is_a_line_of_the_table(
     assert (table["worst tumor off mm: median"] <= table["95 %"]).all()
     assert (tmp_path / "images" / "noise.png").read_bytes().startswith(b"\x89PNG")
 
-    monkeypatch.setattr(noise, "measured", None)  # nothing is measured again
+    monkeypatch.setattr(noise, "measured", pytest.fail)  # nothing is measured again
     noise.main(options)
     assert pd.read_csv(tmp_path / "data" / "noise.csv", comment="#").equals(table)

@@ -193,7 +193,7 @@ def draw(joints_rad: np.ndarray) -> tuple[RigidShape, ...]:
         ),
         RigidShape("holder/cup", solid(trimesh.creation.cylinder(5, 10)), cup, (70, 76, 92)),
         RigidShape(
-            "cutter/electrode", solid(trimesh.creation.cylinder(9, 60)), rod, (222, 190, 80)
+            "cutter/electrode", solid(trimesh.creation.cylinder(9, 60)), rod, (120, 120, 120)
         ),
     )
 

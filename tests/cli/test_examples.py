@@ -1,7 +1,11 @@
 """The examples are documentation: each runs, in order, each on what the ones before it left."""
 
+import contextlib
+import io
 import json
 import re
+import runpy
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +21,23 @@ pytestmark = pytest.mark.slow
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("[0-9]*.py"))
 
 
+@pytest.fixture(scope="module")
+def story(tmp_path_factory):
+    """The folder that all examples wrote into, and what each of them said."""
+    out = tmp_path_factory.mktemp("examples")
+    said = {}
+    for file in EXAMPLES:  # as `python FILE FOLDER`, without loading the package eight times
+        with (
+            pytest.MonkeyPatch.context() as patch,
+            contextlib.chdir(out),
+            contextlib.redirect_stdout(io.StringIO()) as told,
+        ):
+            patch.setattr(sys, "argv", [str(file), str(out)])
+            runpy.run_path(str(file), run_name="__main__")
+        said[file.name[:2]] = told.getvalue()
+    return out, said
+
+
 def test_a_resection_is_planned(story):
     out, said = story
     assert "tumor_1 lies wholly inside" in said["07"]
@@ -26,6 +47,12 @@ def test_a_resection_is_planned(story):
     assert 1 < lost[0] < lost[1] < 60  # ours keeps a margin all round, with plane facets
     for method in ("published", "margin"):
         assert (out / f"plan_{method}.png").stat().st_size > 50_000
+
+
+def test_nothing_has_to_be_trained(story):
+    """The verdict, then the three parts, in the third."""
+    _, said = story
+    assert re.fullmatch(r"(good|poor): .+\n(\w+: [\d.]+ ml at \(.+\) mm\n){3}", said["03"])
 
 
 def test_a_moving_organ_is_followed(story):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from importlib import metadata
 from importlib.metadata import EntryPoint
 
 import numpy as np
@@ -88,7 +89,12 @@ def test_the_exit_status_is_the_commands_where_nobody_reads_on(status):
 
 def test_a_broken_command_of_another_package_stops_no_other(monkeypatch, tmp_path, capsys):
     broken = EntryPoint("broken", "nowhere.at_all:Command", "tumortrack.commands")
-    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: (broken,))
+    found = metadata.entry_points  # other groups are what they are, and remembered
+    monkeypatch.setattr(
+        metadata,
+        "entry_points",
+        lambda group: (broken,) if group == broken.group else found(group=group),
+    )
     assert main.run(["inspect", str(tmp_path)]) == 2
     assert "nothing that inspect knows" in capsys.readouterr().err
     assert main.run(["broken"]) == 2

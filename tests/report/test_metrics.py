@@ -7,10 +7,12 @@ import pytest
 import trimesh
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from scipy.spatial.distance import directed_hausdorff
+from trimesh.triangles import closest_point
 
 from covering import cover
 from tumortrack.core.errors import InputError
-from tumortrack.core.mesh_query import surface_samples
+from tumortrack.core.mesh_query import nearest_places, surface_samples
 from tumortrack.core.raster import voxelise
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh
 from tumortrack.report.metrics import (
@@ -188,3 +190,47 @@ def test_ious_of_shifted_boxes_are_exact():
 def test_the_outward_miss_of_balls(shift, radius, expected):
     reference, estimate = sphere(10.0), sphere(radius, (shift, 0, 0))
     assert outward_miss(estimate, reference) == pytest.approx(expected, abs=0.1)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_hausdorff_agrees_with_scipy_on_dense_samples(seed):
+    a, b = lumpy(seed), lumpy(seed + 10)
+    dense_a, dense_b = (trimesh.sample.sample_surface(
+        trimesh.Trimesh(m.vertices_mm, m.faces, process=False), 60_000, seed=0
+    )[0] for m in (a, b))  # fmt: skip
+    there, back = directed_hausdorff(dense_a, dense_b)[0], directed_hausdorff(dense_b, dense_a)[0]
+    found = surface_distances(a, b)
+    assert found.hausdorff_one_sided_mm == pytest.approx(there, abs=0.12)
+    assert found.hausdorff_mm == pytest.approx(max(there, back), abs=0.12)
+    assert found.hausdorff_mm > 1.0
+
+
+@pytest.mark.parametrize(
+    "target",
+    [lumpy(7), box((22, 25, 28), (2, 1, 0)), uneven(3), sphere(12.0)],
+    ids=["fine", "coarse", "uneven", "round"],
+)
+def test_nearest_places_are_those_of_all_triangles(target):
+    """Points near to it, far from it, on it, and where all of it is equally far."""
+    rng = np.random.default_rng(1)
+    points = np.concatenate([
+        surface_samples(lumpy(6), 4.0)[0][::5], rng.normal(0, 80.0, (30, 3)),
+        target.vertices_mm[:20], np.zeros((1, 3)),
+    ])  # fmt: skip
+    triangles = target.vertices_mm[target.faces]
+    each = (closest_point(triangles, np.tile(p, (len(triangles), 1))) for p in points)
+    exact = np.array(
+        [np.linalg.norm(q - p, axis=1).min() for p, q in zip(points, each, strict=True)]
+    )
+    places = nearest_places(target, points)
+    np.testing.assert_allclose(np.linalg.norm(places - points, axis=1), exact, atol=1e-6)
+    assert np.linalg.norm(nearest_places(target, places) - places, axis=1).max() < 1e-6
+    assert (distance_to_surface(points, target) == np.linalg.norm(points - places, axis=1)).all()
+
+
+def test_truth_outside_the_estimates_grid_counts_as_missed():
+    reference = Anatomy((box((20, 20, 20)),))
+    whole, half = grid((-14.5,) * 3, 1.0), grid((0.5, -14.5, -14.5), 1.0)
+    for frame, shape, iou in ((whole, (30, 30, 30), 1.0), (half, (30, 30, 30), 0.5)):
+        estimate = CameraLabels(label_grid(reference, frame, shape), frame)
+        assert label_ious(estimate, reference)["kidney"] == pytest.approx(iou)

@@ -1,4 +1,4 @@
-"""Cases and scenes, and what is in any folder: `prepare`, `export`, `simulation`, `evaluate`,
+"""Cases and scenes, and what is in any folder: `prepare`, `export`, `simulate`, `evaluate`,
 `inspect`."""
 
 from __future__ import annotations

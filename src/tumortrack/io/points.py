@@ -83,7 +83,8 @@ def _parse_csv(content: bytes, name: str) -> PointTable:
     if replaced := ", ".join(column for column in header if column.lower() in _ADDED):
         notes.append(f"{name}: its columns {replaced} give way to the answer's.")
     if without:
-        notes.append(f"{name}: left out {without} points without a place ({_DEFINED} is 0).")
+        count = f"{without} of {len(table.rows)} points"
+        notes.append(f"{name}: left out {count} that have no place yet ({_DEFINED} is 0).")
     return PointTable(
         points_ct,
         tuple(header[n] for n in kept),

@@ -60,7 +60,7 @@ def evaluate_model(
 
 
 def check_case(model: Model, folders: list[Path]) -> None:
-    """Raises InputError for a scene that `simulation` made from another case than the model's. Scenes
+    """Raises InputError for a scene that `simulate` made from another case than the model's. Scenes
     of other programs, which do not name their case, pass."""
     wanted = model.provenance.get("case_sha256")
     for folder in folders:

@@ -209,7 +209,7 @@ class ExportOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class SimulateOptions:
-    """Options of `simulation`.
+    """Options of `simulate`.
 
     Attributes:
         scenes: how many.

@@ -30,7 +30,7 @@ class VirtualSourceConfig(SourceConfig, frozen=True, kw_only=True, tag="virtual"
         seed: of pose, pushed places, tissue and noise.
         table, drape: around the organ.
         instrument: a shaft that comes and pushes; else nothing pushes.
-        sensor, uncalibrated, tissue: of the noise, as in `simulation`; the unit is the seed's.
+        sensor, uncalibrated, tissue: of the noise, as in `simulate`; the unit is the seed's.
         pulled: states of the organ under the pull of `resect`'s holder (``make pull``).
     """
 
