@@ -90,7 +90,7 @@ cloud = tt.SensorCloud(np.ones((300, 3), np.float32))
 unmade = object.__new__(tt.Tracker)  # it looks at the cloud before the model
 for call in (
     lambda: tt.Tracker("MODEL"),
-    lambda: unmade.locate(np.zeros((2000, 3), np.float32)),
+    lambda: unmade.locate([[0.0, 0.0, 100.0]]),
     lambda: tt.evaluate(print, []),
     lambda: tt.evaluate(7, [1]),
     lambda: tt.find_organ(cloud, model="CASE"),

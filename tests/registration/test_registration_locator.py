@@ -15,6 +15,7 @@ from elastic_objects import CENTER, UP
 from stories import answered, tumortrack
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Motion
+from tumortrack.core.geometry import transform_points
 from tumortrack.core.mesh_query import labels_of, surface_distance
 from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.io.model_folder import save_model
@@ -67,6 +68,35 @@ def test_points_inside_are_found_within_millimetres_wherever_the_camera_stands(
     moved = tracker.locate(SensorCloud(away.astype(np.float32)), grid=16, seed=3)
     expected = estimate.motion.carry(targets) @ turn.T + [5, -8, 60]
     assert np.linalg.norm(moved.motion.carry(targets) - expected, axis=1).mean() < 0.5
+
+
+def test_an_estimate_answers_in_arrays(tracker, stages, estimate):
+    points_ct = ANATOMY.organ.vertices_mm
+    moved = estimate.forward(points_ct)
+    np.testing.assert_array_equal(moved, estimate.motion.carry(points_ct))
+    np.testing.assert_allclose(estimate.inverse(moved), points_ct, atol=0.05)
+    rest_mm = transform_points(estimate.camera_from_ct, points_ct)
+    best = np.linalg.norm(rest_mm - moved, axis=1)
+    assert best.max() < 25
+    for axis in range(3):  # no rigid motion lies nearer
+        for step in (-1.0, 1.0):
+            off = np.linalg.norm(rest_mm + step * np.eye(3)[axis] - moved, axis=1)
+            assert (off**2).mean() > (best**2).mean()
+    assert list(estimate.parts) == list(estimate.report.parts)
+    assert list(estimate.tumors) == [name for name in estimate.parts if "tumor" in name]
+    for name, part in estimate.tumors.items():
+        assert part.mesh is estimate.meshes[name]
+        np.testing.assert_array_equal(part.center_mm, estimate.report.parts[name].center_mm)
+        known = estimate.assessment.shown.get(name)
+        assert part.error_bound95_mm == (known.error_bound95_mm if known else None)
+    points_mm = np.array(stages[0].cloud.points_mm, np.float64)
+    same = [tracker.locate(cloud, grid=16).parts for cloud in (points_mm, SensorCloud(points_mm))]
+    np.testing.assert_array_equal(same[0]["kidney"].center_mm, same[1]["kidney"].center_mm)
+    unmoved = replace(estimate, motion=None)
+    with pytest.raises(InputError):
+        unmoved.forward(points_ct)
+    with pytest.raises(InputError):
+        tracker.locate([[0.0, 0.0, 100.0]])
 
 
 def test_the_same_cloud_and_seed_give_the_same_estimate(tracker, stages, estimate):

@@ -8,16 +8,17 @@ from typing import Any, Protocol, runtime_checkable
 
 import msgspec
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 
 from tumortrack.core.assessment import Assessment, Quality
 from tumortrack.core.config import Config, check_seed
 from tumortrack.core.errors import InputError
 from tumortrack.core.evidence import Evidence
 from tumortrack.core.geometry import Points
-from tumortrack.core.organ import KIDNEY, Organ
+from tumortrack.core.organ import KIDNEY, Organ, is_tumor
 from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.report import Finding, FitReport, Likely
+from tumortrack.core.rigid_fit import kabsch
 from tumortrack.core.types import CameraLabels, Mesh, OccupancyCloud
 
 LARGEST_GRID = 400
@@ -54,6 +55,19 @@ class Motion(Protocol):
 
     def covariance_mm2(self, points_ct: Points, /) -> Float[np.ndarray, "n 3 3"] | None:
         """The covariance in the camera frame."""
+
+
+@dataclass(frozen=True, eq=False)
+class LocatedPart:
+    """Where the organ or a tumor is: ``center_mm`` and ``mesh`` in the camera frame, mm.
+    ``error_bound95_mm``: with 95 % no point of it lies farther off; None: not known, or the answer
+    is poor."""
+
+    name: str
+    center_mm: Float64[np.ndarray, " 3"]
+    volume_ml: float
+    mesh: Mesh
+    error_bound95_mm: float | None
 
 
 class FollowOptions(Config, frozen=True, kw_only=True):
@@ -134,6 +148,54 @@ class Estimate:
     @property
     def reason(self) -> str:
         return self.assessment.reason
+
+    @property
+    def parts(self) -> dict[str, LocatedPart]:
+        """What was found, by name: the organ, then its tumors."""
+        shown = self.assessment.shown
+        return {
+            name: LocatedPart(
+                name,
+                np.array(part.center_mm, np.float64),
+                part.volume_ml or 0.0,
+                self.meshes[name],
+                shown[name].error_bound95_mm if name in shown else None,
+            )
+            for name, part in self.report.parts.items()
+            if part.center_mm is not None and name in self.meshes
+        }
+
+    @property
+    def tumors(self) -> dict[str, LocatedPart]:
+        """The tumors that were found, by name: tumor_1, ..."""
+        return {name: part for name, part in self.parts.items() if is_tumor(name)}
+
+    @property
+    def camera_from_ct(self) -> Float64[np.ndarray, "4 4"]:
+        """The rigid transform that lies nearest to the motion (least squares over the organ's
+        surface). Raises InputError: the method knows no motion."""
+        camera_mm = self.organ_mesh.vertices_mm.astype(np.float64)
+        return kabsch(self.inverse(camera_mm), camera_mm, np.ones(len(camera_mm)))
+
+    def forward(self, points_ct: Points) -> Points:
+        """Points of the CT (n, 3; LPS, mm), also outside the organ, in the camera frame. Raises
+        InputError: the method knows no motion, or they are no finite points."""
+        return self._known_motion().carry(points_ct)
+
+    def inverse(self, points_camera: Points) -> Points:
+        """Points of the camera frame (n, 3; mm) in the CT. Raises InputError as ``forward``."""
+        back = self._known_motion().back(points_camera)
+        if back is None:
+            raise InputError("this method knows its motion in one direction alone.")
+        return back
+
+    def _known_motion(self) -> Motion:
+        if self.motion is None:
+            raise InputError(
+                "this estimate knows no motion: it was read from a folder, or its method has none. "
+                "Locate with a case: Tracker(load_case(FOLDER)).locate(cloud)."
+            )
+        return self.motion
 
     @property
     def organ_mesh(self) -> Mesh:

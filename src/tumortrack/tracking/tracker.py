@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
 from tumortrack.assessment.advice import part_number
 from tumortrack.assessment.causes import causes_of, check_of, words
@@ -80,7 +80,7 @@ class Tracker:
 
     def locate(
         self,
-        cloud: SensorCloud,
+        cloud: SensorCloud | Float[np.ndarray, "n 3"],
         grid: int = 160,
         seed: int = 0,
         seen: DepthFrame | SensorCloud | None = None,
@@ -90,6 +90,7 @@ class Tracker:
         """The full estimate from one cloud; the same cloud and seed give the same result.
 
         Args:
+            cloud: observed points, camera frame, mm; an array will do.
             grid: voxels along the longest side of the dense volume.
             seen: all that the camera saw, by which the estimate is judged; default: the cloud.
             evidence: what else is known of where it lies then: each ``Look`` from another place,
@@ -105,10 +106,12 @@ class Tracker:
                 the organ lacks; more than one look, or evidence, with a model that knows no motion.
         """
         check_seed(seed)
+        if isinstance(cloud, np.ndarray):
+            cloud = SensorCloud(cloud)
         if not isinstance(cloud, SensorCloud):
             raise InputError(
-                f"locate takes a SensorCloud, not {type(cloud).__name__}: read_cloud(FILE), or "
-                "SensorCloud(points_mm) of an n x 3 array in the camera frame."
+                f"locate takes points, n x 3 in mm in the camera frame, or a SensorCloud, not "
+                f"{type(cloud).__name__}: numpy.asarray(POINTS), or read_cloud(FILE)."
             )
         looks: Sequence[Look]
         looks, pieces = _parted(cloud, seen, evidence)
