@@ -25,7 +25,6 @@ from ros2_objects import DOMAIN, Frames, own_graph, read_until
 from ros2_peer import points_mm
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import SensorCloud
-from tumortrack.live.spec import POSES, SINKS, SOURCES, TOOLS, Registry
 from tumortrack.live.values import Observation, Source
 from tumortrack_devices.ros import sensors
 from tumortrack_devices.ros.bus import Bus, open_bus
@@ -279,12 +278,6 @@ def test_damaged_bytes_are_not_sent(bus: Bus, messages: Messages) -> None:
     publish(cdr)
     with pytest.raises(TumortrackError, match="/points"):
         publish(cdr[:60])
-
-
-@pytest.mark.parametrize("kinds", [SOURCES, SINKS, POSES, TOOLS])
-def test_whoever_asks_for_ros_1_is_told_what_to_do(kinds: Registry) -> None:
-    with pytest.raises(InputError, match="ros1_bridge"):
-        kinds.parse("ros1:/camera/points?unit_mm=1")
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,6 @@ import numpy as np
 import pandas as pd
 import tyro
 from scipy.stats import binomtest
-from tumortrack_resection.resection import plan_resection
 
 import tumortrack as tt
 import tumortrack_lab.world.cut
@@ -53,6 +52,7 @@ from tumortrack_lab.world.organ import moved
 from tumortrack_lab.world.scenes import World, WorldConfig
 from tumortrack_lab.world.tets import TETS
 from tumortrack_resection.budget import planned_budgets
+from tumortrack_resection.drafts import plan_resection
 from tumortrack_resection.located import of_estimate
 from tumortrack_resection.values import MARGIN_MM, Located, ResectionConfig, ResectionPlan
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-KEPT = ROOT / "src/tumortrack/tracking/answers.json"
+KEPT = ROOT / "src/tumortrack/assessment/answers.json"
 
 
 @pytest.mark.slow

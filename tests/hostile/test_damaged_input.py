@@ -188,8 +188,8 @@ FILES: dict[str, tuple[str, tuple[object, ...]]] = {
     "points.csv": ("tumortrack.io.points:read_points", ("x,y,z\n1,2,3\n4,5,6\n",)),
     "points.mrk.json": ("tumortrack.io.points:read_points", (MARKUPS,)),
     "points.fcsv": ("tumortrack.io.points:read_points", (FCSV,)),
-    "evidence.json": ("tumortrack.core.evidence:read_evidence", ()),
-    "evidence.csv": ("tumortrack.core.evidence:read_evidence", (EVIDENCE_TABLE,)),
+    "evidence.json": ("tumortrack.io.evidence_files:read_evidence", ()),
+    "evidence.csv": ("tumortrack.io.evidence_files:read_evidence", (EVIDENCE_TABLE,)),
     "calibration.json": (
         "tumortrack.live.calibration_file:read_frames",
         (

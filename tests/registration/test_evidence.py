@@ -22,10 +22,9 @@ from tumortrack.core.evidence import (
     Landmark,
     Outline,
     Touch,
-    evidence_json,
-    read_evidence,
 )
 from tumortrack.core.types import Mesh, SensorCloud
+from tumortrack.io.evidence_files import evidence_json, read_evidence
 from tumortrack.io.ply import write_cloud_ply
 from tumortrack.registration.evidence import EvidenceTerms, Known, still_known
 from tumortrack.registration.looks import Looks

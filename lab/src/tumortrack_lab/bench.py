@@ -27,7 +27,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
-from tumortrack.registration.build import build_model
 
 from tumortrack.case.surface import surfaces
 from tumortrack.cli.console import progress_bar, say
@@ -44,7 +43,7 @@ from tumortrack.io.ply import write_cloud_ply
 from tumortrack.registration.config import clinic
 from tumortrack.registration.frame import grid_over
 from tumortrack.registration.looks import Looks
-from tumortrack.registration.model import RegistrationModel
+from tumortrack.registration.model import RegistrationModel, build_model
 from tumortrack.simulation.deform import DragConfig
 from tumortrack.simulation.phantom.digital import PhantomParameters, phantom_labels
 from tumortrack.simulation.scene import SceneConfig, SceneRecipe, Simulator
@@ -282,8 +281,7 @@ def run_command(*words: object) -> tuple[float, int]:
 
 def _planning(subject: BenchSubject) -> Iterator[Workload]:
     """Both planners, on 40,000 points; motions where the arms' libraries are installed."""
-    from tumortrack_resection.resection import plan_resection
-
+    from tumortrack_resection.drafts import plan_resection
     from tumortrack_resection.located import STAND_MM
     from tumortrack_resection.values import Located, ResectionConfig
 
@@ -303,11 +301,10 @@ def _planning(subject: BenchSubject) -> Iterator[Workload]:
         yield Workload("plan", name, "plan", partial(plan_resection, located, config))
     if find_spec("pinocchio") is None:  # the extra `arms`
         return
-    from tumortrack_resection.checking import checked
-
     from tumortrack_resection.arms.body import cell_urdf
     from tumortrack_resection.arms.config import CellConfig
     from tumortrack_resection.arms.procedure import plan_motions
+    from tumortrack_resection.check import checked
     from tumortrack_resection.planning import below
 
     cell = below(located.organ, CellConfig())

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from tumortrack_lab.cut import cut as cut_out
 
 from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import Anatomy, Mesh
+from tumortrack_lab.world.cut import cut as cut_out
 from tumortrack_resection.budget import foreseen_mm
 from tumortrack_resection.check import TOLERANCE_MM
 from tumortrack_resection.facets import Tools

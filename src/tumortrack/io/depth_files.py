@@ -269,7 +269,7 @@ def _camera(path: Path) -> _Camera:
 
     width, height, fx, fy, cx, cy = map(number, _PINHOLE_KEYS)
     if not (width.is_integer() and height.is_integer()):
-        raise InputError(f"{path}: {width:g} x {height:g} pixels; these must be whole numbers.")
+        raise InputError(f"{path}: width {width:g} and height {height:g} must be whole numbers.")
     error = None  # nobody has calibrated it
     if data.keys() & {_LEFT_KEY, "depth_scale", "depth_offset_mm"}:
         error = DepthError(number(_LEFT_KEY, CALIBRATED_MM))
