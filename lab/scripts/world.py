@@ -40,8 +40,8 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.mesh_query import surface_samples
 from tumortrack.core.types import Anatomy, OccupancyCloud
 from tumortrack.io.scene_folder import Scene, read_scene
+from tumortrack.registration.estimate import QUERIES
 from tumortrack.registration.frame import estimate_of
-from tumortrack.registration.locator import QUERIES
 from tumortrack.report.metrics import distance_to_surface
 from tumortrack_lab import scripting
 from tumortrack_lab.document import table_of

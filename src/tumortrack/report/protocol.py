@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -14,7 +15,7 @@ from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import FAR_MM, Estimate
-from tumortrack.core.process import undisturbed
+from tumortrack.core.process import available_cores, undisturbed
 from tumortrack.core.store import read_json, write_json, writing
 from tumortrack.io.scene_folder import Scene, list_scenes, read_scene
 from tumortrack.registration.base_model import Model
@@ -27,6 +28,7 @@ from tumortrack.tracking.tracker import Tracker
 
 Locate = Callable[..., Estimate]  # of a cloud; where a scene has some, of ``evidence=``, too
 Compare = Callable[[Scene], dict[str, Any]]
+_THREADS = 2  # scenes at once: what is Python alone runs in turns, and more gain little
 _OURS = {"scenes", "index.html", "report.json"}
 
 
@@ -56,7 +58,8 @@ def evaluate_model(
         "seed": seed,
     }
     locate = partial(model.locate, grid=grid, seed=seed)
-    return evaluate_scenes(locate, scenes_dir, out, progress, about, rivals_of(model.model))
+    rivals, threads = rivals_of(model.model), min(available_cores(), _THREADS)
+    return evaluate_scenes(locate, scenes_dir, out, progress, about, rivals, threads)
 
 
 def check_case(model: Model, folders: list[Path]) -> None:
@@ -82,6 +85,7 @@ def evaluate_scenes(
     progress: Callable[[], None] = lambda: None,
     about: dict[str, Any] | None = None,
     rivals: Compare | None = None,
+    threads: int = 1,
 ) -> dict[str, Any]:
     """Evaluate ``locate`` on every scene of a folder; OUT gets report.json, scenes/NAME.png and
     index.html, in place of a report that is there (``check_place`` says whether that is allowed).
@@ -93,6 +97,7 @@ def evaluate_scenes(
         progress: called after each scene.
         about: plain JSON for the report: the model and options behind ``locate``.
         rivals: rigid registration of a scene, see ``report.rivals.Rivals``.
+        threads: scenes at once; over 1 only if ``locate`` may be called by several.
 
     Raises:
         InputError: no scenes, or a scene that cannot be read.
@@ -102,22 +107,27 @@ def evaluate_scenes(
     from tumortrack.report.pictures import scene_picture
 
     folders, entries, shown = list_scenes(scenes_dir), list[dict[str, Any]](), []
+
+    def judged(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+        scene = read_scene(folder)
+        entry, estimate = evaluate_scene(locate, scene, folder.name, rivals)
+        if isinstance(stated := scene.meta.get("registration"), dict):  # of a second CT
+            entry["registration_mm"] = stated.get("tre_mm", {})
+        if isinstance(said := scene.meta.get("words"), str):
+            entry["words"] = said
+        meshes = estimate.meshes if estimate else {}
+        picture = out / "scenes" / f"{folder.name}.png"
+        scene_picture(scene, meshes, entry, picture)
+        return entry, page_scene(scene, meshes, picture)
+
     clear(out)
+    pool = ThreadPoolExecutor(threads)
     try:
         with writing(out):
             (out / "scenes").mkdir(parents=True, exist_ok=True)
-        for folder in folders:
-            scene = read_scene(folder)
-            entry, estimate = evaluate_scene(locate, scene, folder.name, rivals)
-            if isinstance(stated := scene.meta.get("registration"), dict):  # of a second CT
-                entry["registration_mm"] = stated.get("tre_mm", {})
-            if isinstance(said := scene.meta.get("words"), str):
-                entry["words"] = said
-            meshes = estimate.meshes if estimate else {}
-            picture = out / "scenes" / f"{folder.name}.png"
-            scene_picture(scene, meshes, entry, picture)
-            shown.append(page_scene(scene, meshes, picture))
+        for entry, seen in pool.map(judged, folders) if threads > 1 else map(judged, folders):
             entries.append(entry)
+            shown.append(seen)
             progress()
         report = {
             "tumortrack": tumortrack.__version__,
@@ -133,8 +143,10 @@ def evaluate_scenes(
         write_page(report, shown, out / "index.html")
     except BaseException:  # Ctrl-C, too: an unfinished report would block the next command
         with undisturbed():
+            pool.shutdown(cancel_futures=True)
             clear(out)
         raise
+    pool.shutdown()
     return report
 
 
