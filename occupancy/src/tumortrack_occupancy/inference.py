@@ -23,8 +23,7 @@ class Inference:
     def __init__(self, network: OccupancyNetwork, bfloat16: bool | None = None) -> None:
         self.network = network.folded()
         self.device = next(network.parameters()).device
-        fast = has_fast_bfloat16(self.device) if bfloat16 is None else bfloat16
-        self._autocast = torch.autocast(self.device.type, torch.bfloat16, enabled=fast)
+        self._bfloat16 = has_fast_bfloat16(self.device) if bfloat16 is None else bfloat16
         on_cpu = self.device.type == "cpu"
         self._rows = _CHUNK * torch.get_num_threads() if on_cpu else _CHUNK_GPU
 
@@ -35,18 +34,21 @@ class Inference:
         points = torch.tensor(points_mm, dtype=torch.float32)[None].to(self.device)
         if self.device.type == "cpu":
             return self.network.encode(points)
-        with self._autocast:
+        with self._arithmetic():
             return self.network.encode(points)
 
     @torch.inference_mode()
     def logits(self, latent: Latent, points_mm: Float32[np.ndarray, "n 3"]) -> Tensor:
         """Points, camera frame, mm -> (n, classes), float32, on the network's device."""
         queries = padded(torch.tensor(points_mm, dtype=torch.float32)[None].to(self.device))
-        with self._autocast:
+        with self._arithmetic():
             parts = latent.normalised(queries).split(self._rows, dim=1)
             decoder = self.network.decoder
             logits = torch.cat([decoder(latent.terms, part).float() for part in parts], 1)
         return logits[0, : len(points_mm)]
+
+    def _arithmetic(self) -> torch.autocast:  # its own for each call: it keeps what was before
+        return torch.autocast(self.device.type, torch.bfloat16, enabled=self._bfloat16)
 
 
 def padded(queries: Tensor) -> Tensor:

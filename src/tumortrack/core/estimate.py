@@ -157,7 +157,7 @@ class Estimate:
             name: LocatedPart(
                 name,
                 np.array(part.center_mm, np.float64),
-                part.volume_ml or 0.0,
+                self.meshes[name].volume_ml,
                 self.meshes[name],
                 shown[name].error_bound95_mm if name in shown else None,
             )

@@ -302,7 +302,7 @@ class Loop:
         if has != self._source_intrinsics:
             return InputError(
                 "the camera's own intrinsics changed, and those of --intrinsics were for the ones "
-                "before. If that is meant, calibrate it anew and start again."
+                "before. If that is meant, calibrate it again and restart."
             )
         if (has.width, has.height) != (given.width, given.height):
             return InputError(
