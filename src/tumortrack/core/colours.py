@@ -21,7 +21,6 @@ ORGAN_PART: Colour = (185, 102, 83)
 TUMORS = ((230, 159, 0), (86, 180, 233), (240, 228, 66), (204, 121, 167), (0, 158, 115))
 STRUCTURES = ((214, 40, 40), (70, 110, 220), (245, 225, 170), (150, 110, 60), (60, 170, 160))
 TRUTH: Colour = (0, 90, 160)  # outlines: darker than any tumor
-OBSERVED: Colour = (64, 64, 64)
 PIECE: Colour = (110, 80, 200)  # that a plan removes
 SEEN: Colour = (112, 118, 126)
 ORGAN: Colour = (225, 230, 235)

@@ -1,5 +1,4 @@
-"""Parts of pictures: figures without a display, text that is never cut off, sections of meshes,
-scale bars."""
+"""Figures without a display, with text that is never cut off."""
 
 from __future__ import annotations
 
@@ -8,29 +7,17 @@ import pathlib
 from collections.abc import Iterator, Sequence
 from typing import Any, cast
 
-import numpy as np
-from jaxtyping import Bool, Float
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.legend import Legend
-from matplotlib.patches import PathPatch
-from matplotlib.path import Path
 from matplotlib.text import Text
 
 from tumortrack.core import colours
-from tumortrack.core.geometry import plane_section
-from tumortrack.core.raster import voxelise
 from tumortrack.core.store import write_atomically
-from tumortrack.core.types import FIRST_TUMOR, Mesh
-from tumortrack.report.renderer import RGB, Body, Frame, ParallelView, rgb
+from tumortrack.report.renderer import rgb
 from tumortrack.report.wrapping import wrapped
 
-ORGAN = rgb(colours.ORGAN_PART)
-ESTIMATED = rgb(colours.part_colour(FIRST_TUMOR))  # of one tumor, or a curve
-TRUE = rgb(colours.TRUTH)
-OBSERVED = rgb(colours.OBSERVED)
 _WARNING: dict[str, Any] = {
     **{"fontsize": 12, "fontweight": "bold", "color": "white"},
     "bbox": {"facecolor": rgb(colours.NONE), "edgecolor": "none", "boxstyle": "square,pad=0.3"},
@@ -128,74 +115,3 @@ def save(figure: Figure, path: pathlib.Path) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", pil_kwargs={"compress_level": 3})  # half of 6's time
     write_atomically(path, buffer.getvalue())
-
-
-def section(
-    mesh: Mesh, view: ParallelView, through_mm: Float[np.ndarray, " 3"]
-) -> Float[np.ndarray, "n 2 2"]:
-    """Outline of a mesh in the view's plane through a point: segments as (right, down) mm."""
-    ends_mm = plane_section(mesh.vertices_mm, mesh.faces, view.axes[2], through_mm)
-    return view.project(ends_mm.reshape(-1, 3))[:, :2].reshape(-1, 2, 2)
-
-
-def section_mask(
-    mesh: Mesh, view: ParallelView, frame: Frame, through_mm: Float[np.ndarray, " 3"]
-) -> Bool[np.ndarray, "h w"]:
-    """Pixels of a frame that lie inside a closed mesh, in the view's plane through a point."""
-    # Rays along the rows, so that only triangles in the plane are met
-    (x, y), axes = frame.pixel_centres(), view.axes.T[:, [2, 1, 0]]
-    data_from_index = np.eye(4)
-    data_from_index[:3, :3] = axes * [1.0, y[1] - y[0], x[1] - x[0]]
-    data_from_index[:3, 3] = axes @ [view.project(through_mm[None])[0, 2], y[0], x[0]]
-    return voxelise(mesh, data_from_index, (1, len(y), len(x)))[0]
-
-
-def show_bodies(axes: Axes, view: ParallelView, bodies: list[Body], frame: Frame) -> None:
-    picture = view.draw(bodies, frame)
-    axes.imshow(picture, extent=frame.extent, zorder=2, interpolation="bilinear")
-
-
-def outline(
-    axes: Axes, mesh: Mesh, view: ParallelView, color: RGB | str, width: float, **style: Any
-) -> None:
-    """Draw the mesh's silhouette as a contour."""
-    around = view.frame_around(mesh.vertices_mm, 1.0)
-    mask = view.silhouette(mesh, around)
-    style |= {"levels": [0.5], "colors": [color], "linewidths": width}
-    axes.contour(*around.pixel_centres(), mask, **style)
-
-
-def draw_lines(axes: Axes, segments: Float[np.ndarray, "n 2 2"], **style: Any) -> None:
-    codes = np.tile(np.array([Path.MOVETO, Path.LINETO], Path.code_type), len(segments))
-    lines = Path(segments.reshape(-1, 2), codes)  # as one: many are slow
-    axes.add_artist(PathPatch(lines, fill=False, capstyle="round", **style))
-
-
-def finish_view(
-    axes: Axes,
-    frame: Frame,
-    arrows: dict[str, tuple[float, float]] | None = None,
-    background: str = "white",
-) -> None:
-    """Set up axes in mm with equal scales, down pointing down, without ticks, and a scale bar of a
-    round length at the lower left. ``arrows``, at the upper left: letter of an axis -> direction
-    (right, down)."""
-    axes.set(xlim=(frame.left, frame.right), ylim=(frame.bottom, frame.top), aspect="equal")
-    axes.set(xticks=[], yticks=[], facecolor=background)
-    for spine in axes.spines.values():
-        spine.set_color("0.8")
-    width, height = frame.right - frame.left, frame.bottom - frame.top
-    length = max(n for n in (1, 2, 5, 10, 20, 50, 100) if n <= max(0.3 * width, 1))
-    x, y = frame.left + 0.05 * width, frame.bottom - 0.05 * height
-    color = "black" if background == "white" else "white"
-    axes.plot([x, x + length], [y, y], color=color, linewidth=3, solid_capstyle="butt")
-    style: dict[str, Any] = {"color": color, "ha": "center", "va": "bottom", "fontsize": 9}
-    axes.text(x + length / 2, y - 0.015 * height, f"{length} mm", **style)
-    span, ways = 0.07 * min(width, height), arrows or {}
-    rises = any(down < 0 for _, down in ways.values())  # arrows that point up start lower
-    x, y = frame.left + 0.6 * span, frame.top + (2.1 if rises else 0.6) * span
-    arrow = {"arrowstyle": "->", "color": "0.35", "shrinkA": 0, "shrinkB": 0}
-    for letter, (right, down) in ways.items():
-        axes.annotate("", (x + right * span, y + down * span), (x, y), arrowprops=arrow)
-        spot = x + 1.5 * right * span, y + 1.5 * down * span
-        axes.text(*spot, letter, color="0.35", fontsize=8, **CENTRED)

@@ -24,7 +24,6 @@ _CREASE_RAD = np.radians(40.0)  # faces that meet at a sharper angle keep their 
 _WORLD_LIGHT = np.array([-0.42, -0.5, 1.0])  # towards it: from the left, the front and above
 _VIEW_LIGHT = np.array([-0.35, -0.55, -1.0])  # right, down, away: over the viewer's left shoulder
 _SAME_MM = 0.6  # a translucent surface this close to an opaque one counts as the same
-_DRAWN_MM = 0.3  # a pixel of a parallel view
 _FAR_MM = 10_000.0  # the viewer of a parallel view
 
 RGB = tuple[float, float, float]  # each in 0..1
@@ -125,11 +124,6 @@ class Frame:
     top: float
     bottom: float
 
-    @property
-    def extent(self) -> tuple[float, float, float, float]:
-        """As matplotlib's imshow wants it, down pointing down."""
-        return (self.left, self.right, self.bottom, self.top)
-
     def size(self, pixel_mm: float) -> tuple[int, int]:
         """Width and height in pixels."""
         width, height = self.right - self.left, self.bottom - self.top
@@ -186,10 +180,6 @@ class ParallelView:
         light = _VIEW_LIGHT @ axes / np.linalg.norm(_VIEW_LIGHT)
         return Viewpoint(place_mm, axes, _FAR_MM, 2 * half[0], light, -axes[2], parallel=True)
 
-    def draw(self, bodies: list[Body], frame: Frame) -> UInt8[np.ndarray, "h w 3"]:
-        """The bodies on white, row 0 at the frame's top: for ``imshow`` with ``frame.extent``."""
-        return render(bodies, self.viewpoint(frame, _DRAWN_MM), frame.size(_DRAWN_MM))
-
     def depth_of(
         self, mesh: Mesh, frame: Frame, pixel_mm: float = 0.25
     ) -> Float[np.ndarray, "h w"]:
@@ -198,12 +188,6 @@ class ParallelView:
         corners = viewpoint.project(mesh.vertices_mm, size).astype(np.float32)[mesh.faces]
         near, _ = nearest(corners, *size, np.inf, False)
         return -near.astype(float) - _FAR_MM
-
-    def silhouette(
-        self, mesh: Mesh, frame: Frame, pixel_mm: float = 0.25
-    ) -> Float[np.ndarray, "h w"]:
-        """1.0 where the mesh covers the picture, else 0.0: for a contour at 0.5."""
-        return np.isfinite(self.depth_of(mesh, frame, pixel_mm)).astype(float)
 
 
 def render(
