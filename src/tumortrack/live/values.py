@@ -383,15 +383,19 @@ class Controls:
             )
         ((column, row),), _ = project(place_mm[None], seen.content.intrinsics)
         new = sample_click(seen.content, seen.picture, (round(row), round(column)), organ)
-        self.clicks, self.taught = (*self.clicks, new), None
+        clicks, taught = (*self.clicks, new), None
         try:
-            self.taught = teach(self.clicks)
-            state = f"in use: {100 * self.taught.right:.0f} % of a click are told by the others"
+            taught = teach(clicks)
+            state = f"in use: {100 * taught.right:.0f} % of a click are told by the others"
         except InputError as error:
             state = f"not in use: {error}"
-        count = sum(click.organ for click in self.clicks)
-        beside = len(self.clicks) - count
-        self.colour = f"clicks: {count} on the organ, {beside} beside it; {state}"
+        count = sum(click.organ for click in clicks)
+        # At once: no frame in between may be without what former clicks taught.
+        self.clicks, self.taught, self.colour = (
+            clicks,
+            taught,
+            f"clicks: {count} on the organ, {len(clicks) - count} beside it; {state}",
+        )
 
     def forget(self) -> None:
         self.picked_mm, self.clicks, self.taught, self.colour = None, (), None, ""

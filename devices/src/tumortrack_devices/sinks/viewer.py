@@ -296,30 +296,34 @@ class ViewerSink:
 
     def _clicked(self, event: SceneClickEvent) -> None:
         with self._lock:
-            organ, result = self._asked, self._result
-            if organ is None:
+            if self._asked is None:
                 return
-            self._ask(organ)
-            if result is None or (seen := result.observation) is None:
-                event.client.add_notification("Nothing is seen at present", "Click again later.")
-                return
-            pose, points_mm = result.published_frame.published_from_camera, seen_points(seen)
-            ray = np.array(event.ray_origin), np.array(event.ray_direction)
-            place_mm = point_under(transform_points(pose, points_mm.astype(float)), *ray)
-            if place_mm is None:
-                event.client.add_notification("No observed point there", "Click on the points.")
-                return
-            controls = self._context.controls
             try:
-                place_in_camera = transform_points(np.linalg.inv(pose), place_mm[None])[0]
-                controls.click(seen, place_in_camera, organ)
-            except InputError as error:
-                if not organ or seen.picture is not None:
-                    event.client.add_notification("This click taught no colour", str(error))
-            if organ:
-                controls.picked_mm = place_mm
-                self._scene.mark(place_mm)
-            self.panel.say_clicks(None, controls)
+                self._take_click(event, self._asked)
+            finally:  # the buttons change last: whoever waits for them finds the click taken
+                self._ask(self._asked)
+
+    def _take_click(self, event: SceneClickEvent, organ: bool) -> None:
+        result = self._result
+        if result is None or (seen := result.observation) is None:
+            event.client.add_notification("Nothing is seen at present", "Click again later.")
+            return
+        pose, points_mm = result.published_frame.published_from_camera, seen_points(seen)
+        ray = np.array(event.ray_origin), np.array(event.ray_direction)
+        place_mm = point_under(transform_points(pose, points_mm.astype(float)), *ray)
+        if place_mm is None:
+            event.client.add_notification("No observed point there", "Click on the points.")
+            return
+        controls = self._context.controls
+        try:
+            place_in_camera = transform_points(np.linalg.inv(pose), place_mm[None])[0]
+            controls.click(seen, place_in_camera, organ)
+        except InputError as error:
+            if not organ or seen.picture is not None:
+                event.client.add_notification("This click taught no colour", str(error))
+        if organ:
+            controls.picked_mm = place_mm
+            self._scene.mark(place_mm)
 
     def _forget(self) -> None:
         with self._lock:
