@@ -121,8 +121,8 @@ test-hard: setup  ## tests on narrow vector units beside two busy processes (ARG
 	trap "kill $$one $$two" EXIT; ONEDNN_MAX_CPU_ISA=AVX2 ATEN_CPU_CAPABILITY=avx2 \
 	OMP_NUM_THREADS=1 $(BIN)/pytest $(ARGS)
 
-bench: setup  ## speed of every part; fills docs/performance.md and docs/data/speed*.csv (5 minutes; ARGS=--quick)
-	$(BIN)/tumortrack bench --document docs/performance.md $(ARGS)
+bench: setup  ## speed of every part; fills docs/results.md and docs/data/speed*.csv (5 minutes; ARGS=--quick)
+	$(BIN)/tumortrack bench --document docs/results.md $(ARGS)
 
 soak: setup  ## an hour of tracking with faults of eleven kinds (ARGS="MODEL CASE --minutes 5"; after make demo)
 	$(BIN)/python lab/scripts/soak.py $(ARGS)
@@ -151,8 +151,8 @@ noise: setup  ## good answers and tumors' errors against noise, cameras and dist
 rehearsal: setup  ## the experiment on a bench that does not exist, by all its commands (ARGS="CASE MODEL OUT", after make demo)
 	$(BIN)/python lab/scripts/rehearsal.py $(ARGS)
 
-pictures: demo debian  ## the pictures in docs/images that the demo shows (docs/pictures.md has the others; 10 minutes)
-	cp runs/demo/scenes/8-pulled.png docs/images/demo.png
+pictures: demo debian  ## the pictures in docs/images that the demo shows (docs/maintaining.md has the others; 10 minutes)
+	$(BIN)/python lab/scripts/picture.py runs/demo/case docs/images/demo.png
 	$(BIN)/tumortrack locate runs/demo/case runs/demo/dataset/1-rest/cloud.ply runs/pictures/run --depth-error 0 --overwrite
 	$(BIN)/tumortrack plan runs/pictures/run runs/pictures/plan --accept-budget --overwrite
 	cp runs/pictures/plan/plan.png docs/images/plan.png

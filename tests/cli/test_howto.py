@@ -27,6 +27,7 @@ LEFT = {  # what a page's commands leave behind, besides what they print
     "evidence": ("RUN/report.json", "TOUCHED/tumor_1.ply"),
     "organ": ("LIVER/liver.ply",),
     "plan": ("PLAN/plan.png",),
+    "poor-answer": ("RUN/index.html",),
     "ros2": ("report.json",),
     "slicer": ("FOR_SLICER/case.seg.nrrd", "RUN/labels.seg.nrrd"),
 }

@@ -19,7 +19,7 @@ class Bench:
         only: which parts; default: all.
         quick: shorter measurements, about a minute in all once there is a model (in runs/bench).
         out: JSON file to write.
-        document: Markdown file that shows the tables, such as docs/performance.md; they go to
+        document: Markdown file that shows the tables, such as docs/results.md; they go to
             data/*.csv beside it.
     """
 
