@@ -208,7 +208,7 @@ def attack_base(request, once, phantom_case, clinic_model) -> Path:
             return
         (base / "network").symlink_to(request.getfixturevalue("quick_model"))
         cloud = base / "scenes" / "0000" / "cloud.ply"
-        answered(tumortrack("locate", base / "model", cloud, base / "run"))
+        answered(tumortrack("locate", base / "model", cloud, "--out", base / "run"))
         accepted = ("--accept-poor", "--accept-budget")
         succeeded(tumortrack("plan", base / "run", base / "plan", *accepted))
 

@@ -28,10 +28,10 @@ def main(out: Path) -> None:
             surfaces[name] = part.moved(moved)
         return tt.estimate_from_surfaces(surfaces, grid=96)
 
-    (entry,) = tt.evaluate(undeformed, out / "scenes", out / "compared")["scenes"]
-    for name, part in entry["parts"].items():
-        print(f"{name}: Hausdorff {part['hausdorff_mm']:.1f} mm, centre {part['center_mm']:.1f} mm")
-    print(f"mIoU {entry['miou']:.2f}; open {out / 'compared' / 'index.html'}")
+    (errors,) = tt.evaluate(undeformed, out / "scenes", out / "compared").scenes
+    for name, part in errors.parts.items():
+        print(f"{name}: Hausdorff {part.hausdorff_mm:.1f} mm, centre {part.center_mm:.1f} mm")
+    print(f"mIoU {errors.miou:.2f}; open {out / 'compared' / 'index.html'}")
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ def main(out: Path, case_folder: Path, cloud_file: Path) -> None:
     for name, mesh in estimate.meshes.items():
         x, y, z = mesh.box_mm.mean(0)
         print(f"{name}: {mesh.volume_mm3 / 1000:.1f} ml at ({x:.1f}, {y:.1f}, {z:.1f}) mm")
-    tt.save_estimate(estimate, out / "located", overwrite=True)
+    estimate.save(out / "located", overwrite=True)
     print(f"surfaces, labelled volume and report are in {out / 'located'}")
 
 

@@ -40,7 +40,7 @@ def main(out: Path) -> None:
 
     # And back: what is it in the CT that the camera sees here?
     seen = scene.cloud.points_mm[:1]
-    print(f"the camera's point {place(seen[0])} is {place(motion.back(seen)[0])} in the CT")
+    print(f"the camera's point {place(seen[0])} is {place(estimate.inverse(seen)[0])} in the CT")
 
 
 if __name__ == "__main__":

@@ -26,7 +26,8 @@ class PrintingSink:
         self.estimates += 1
         middle, off_mm = placed.meshes["tumor_1"].box_mm.mean(0), np.nan
         if result.observation is not None and result.observation.truth is not None:
-            off_mm = np.linalg.norm(middle - result.observation.truth.tumors[0].box_mm.mean(0))
+            true_mm = result.observation.truth.tumors[0].box_mm.mean(0)
+            off_mm = float(np.linalg.norm(middle - true_mm))
         print(
             f"frame {result.sequence} ({result.quality}): tumor 1 at {middle.round(1)} mm, off by "
             f"{off_mm:.1f} mm; {result.latency_ms:.0f} ms after the frame"
@@ -39,13 +40,13 @@ class PrintingSink:
 def main(out: Path, frames: int) -> None:
     tracker, sink = tt.Tracker(tt.load_case(out / "case")), PrintingSink()
     # Everything that the camera sees goes in; the organ is found in it.
-    report = tt.track(
+    summary = tt.track(
         tracker,
         f"virtual:{out / 'case'}?fps=10",
         [sink],
         until=lambda result: sink.estimates >= frames,
     )
-    print(f"latency p50 {report['latency_ms']['p50']} ms, {report['dropped']} frames dropped")
+    print(f"latency p50 {summary.latency_ms.p50} ms, {summary.dropped} frames dropped")
 
 
 if __name__ == "__main__":

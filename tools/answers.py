@@ -212,7 +212,7 @@ def plan() -> Numbers:
     cloud = Path("scene/cloud.ply")
     with store.new_folder(Path("scene")) as aside:
         write_scene_files(aside, maker("elastic")(0))
-    command("locate", "case", cloud, "run")
+    command("locate", "case", cloud, "--out", "run")
     command("plan", "run", "plan", "--accept-poor", "--accept-budget")
     made = json.loads(Path("plan/plan.json").read_text())["plan"]
     return {

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from websockets.exceptions import InvalidStatus
 
-from clock import PATIENCE_S, until
+from clock import PATIENCE_S, Clock, until
 from igtl_objects import hear
 from live_objects import small_setting, small_update
 from tumortrack.core.errors import InputError
@@ -113,11 +113,12 @@ def test_loopback_is_known_by_any_of_its_names():
     assert not any(map(is_loopback, ("0.0.0.0", "::", "192.168.1.4", "robot", "")))
 
 
-def test_pace_lets_a_second_pass_and_then_holds_back():
+def test_pace_lets_a_second_pass_and_then_holds_back(monkeypatch):
+    monkeypatch.setattr("tumortrack_devices.network.time", Clock())
     pace = Pace(100)
     waits = [pace.wait_s() for _ in range(300)]
-    assert waits[:99] == [0.0] * 99
-    assert waits[-1] == pytest.approx(2.0, abs=1)
+    assert waits[:100] == pytest.approx([0.0] * 100, abs=1e-6)
+    assert waits[100:] == pytest.approx([0.01 * n for n in range(1, 201)], abs=1e-6)
 
 
 # Harm: clients that are many, silent, slow, deaf, or say no message

@@ -121,9 +121,7 @@ def test_depth_images_from_another_process(by: str) -> None:
                 return seen if time.time_ns() - seen.stamp_ns < 200_000_000 else None
 
             fresh = until(newest)
-        while source.read(0.3) is not None:
-            pass
-        assert source.read(0.3) is None  # the publisher is gone
+        until(lambda: source.read(0.3) is None, "the publisher's end")
         with peer("send", "image", 60, 600, by=by):
             again = complete(lambda: read_until(source))
             assert again.stamp_ns > fresh.stamp_ns

@@ -128,21 +128,16 @@ def source(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Source]:
 def frames_of(source: Source, count: int) -> list[Observation]:
     """So many frames, or as many as come until the end."""
     frames: list[Observation] = []
-    patience = time.monotonic() + PATIENCE_S
-    while len(frames) < count:
-        assert time.monotonic() < patience, f"{len(frames)} frames in {PATIENCE_S:g} s"
-        try:
-            seen = source.read(1.0)
-        except SourceEnded:
-            break
-        if seen is not None:
-            frames.append(seen)
+    with contextlib.suppress(SourceEnded):
+        while len(frames) < count:
+            frames.append(until(lambda: source.read(1.0), "a frame"))
     return frames
 
 
 def test_frames_come_in_order_in_mm_and_read_only(source: Source):
     frames = frames_of(source, 5)
-    assert len(frames) >= 3
+    assert len(frames) >= 1
+    assert len(frames) + source.dropped >= 5  # the newest counts; a lossless one drops none
     stamps = [seen.stamp_ns for seen in frames]
     assert all(type(stamp) is int for stamp in stamps)
     assert (np.diff(stamps) > 0).all()
@@ -168,7 +163,7 @@ def test_arrival_is_this_moment_and_not_before_a_host_clocks_stamp(source: Sourc
     frames = frames_of(source, 5)
     end_ns = time.time_ns()
     for seen in frames[1:]:  # the first may have come before it was asked for
-        assert begin_ns - 1e9 <= seen.arrived_ns <= end_ns
+        assert begin_ns - PATIENCE_S * 1e9 <= seen.arrived_ns <= end_ns
     if source.host_clock:
         ages_s = [(seen.arrived_ns - seen.stamp_ns) * 1e-9 for seen in frames]
         assert min(ages_s) >= 0

@@ -248,7 +248,9 @@ def test_a_mistyped_device_and_an_unread_type_are_told_apart_from_silence(pointe
     until(lambda: not trouble(tool), "the pose")
 
 
-@pytest.mark.parametrize("beside", ["checksum off", "an image of 6 MB", "a checksum that is wrong"])
+@pytest.mark.parametrize(
+    "beside", ["checksum off", "an image of 6 MB", "a checksum that is wrong", "a lost pose"]
+)
 def test_what_lies_beside_poses_does_not_end_the_connection(beside, pointer):
     tool, sock = pointer.make()
     one = posed("Stylus", 0)
@@ -256,6 +258,9 @@ def test_what_lies_beside_poses_does_not_end_the_connection(beside, pointer):
         sock.sendall(DAMAGED)
         until(lambda: trouble(tool), "the fault")
         assert place_at(tool, pointer.clock.time_ns()) is None
+    elif beside == "a lost pose":
+        nowhere, lost = igtl.pack_transform(np.eye(4)), {"TransformStatus": "MISSING"}
+        sock.sendall(pack(Message("TRANSFORM", "Stylus", 0, nowhere, lost)))
     elif beside == "an image of 6 MB":
         head = struct.pack("> H 12s 20s Q Q Q", 1, b"IMAGE", b"Image", 0, 6_000_000, 1)
         sock.sendall(head + bytes(6_000_000))

@@ -16,7 +16,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import needs
-from clock import until
+from clock import PATIENCE_S, Clock, until
 from live_objects import STAMP_NS, small_anatomy, small_estimate, small_frame, small_setting
 from rtde_arm import RtdeArm
 from tumortrack.core.assessment import NOT_JUDGED
@@ -289,7 +289,7 @@ def string(text):
 def tracker():
     """A server as PlusServer is one, for one client; ``link()`` takes it in."""
     server = socket.create_server(("127.0.0.1", 0))
-    server.settimeout(60)
+    server.settimeout(PATIENCE_S)
     opened = [server]
 
     def link():
@@ -314,19 +314,16 @@ def test_a_tracked_pointer_touches_over_openigtlink():
     ) as server:
         port = int(server.stdout.readline())
 
-        def tell(word):
-            server.stdin.write(f"{word}\n")
-            server.stdin.flush()
-            server.stdout.readline()
-
         options = {"name": name, "tip": (0.0, 0.0, 10.0), "tip_mm": 1.0}
         config = OpenIgtLinkToolConfig(address=f"127.0.0.1:{port}", **options)
-        tool = config.open(setting(), "pointer")
+        tool, begin_ns = config.open(setting(), "pointer"), time.time_ns()
         try:
             until(lambda: tool.link.receivers)
 
             def touched():  # again, where a busy machine lost poses for over a tenth of a second
-                tell("touch")
+                server.stdin.write("touch\n")
+                server.stdin.flush()
+                server.stdout.readline()
                 now = view(time.time_ns())
                 pieces = tool.evidence(now)
                 tool.located(now, small_estimate())
@@ -336,11 +333,7 @@ def test_a_tracked_pointer_touches_over_openigtlink():
             assert isinstance(touch, Touch)
             # The base's z points towards the camera.
             np.testing.assert_allclose(touch.place_mm, (5, 6, 120), atol=1e-3)
-            assert abs(touch.stamp_ns - time.time_ns()) < 60e9
-            tell("missing")
-            time.sleep(0.2)
-            assert tool.evidence(view(time.time_ns())) == []
-            assert tool.trouble == ""
+            assert begin_ns < touch.stamp_ns < time.time_ns()
         finally:
             tool.close()
             server.kill()
@@ -392,10 +385,12 @@ def test_damaged_messages_are_named_and_the_next_ones_are_heard(tracker):
         tools.close()
 
 
-def test_what_is_drawn_in_slicer_counts_once_it_rests():
+def test_what_is_drawn_in_slicer_counts_once_it_rests(monkeypatch):
     """Slicer, here pyigtl, connects to us; its axes are RAS."""
     import pyigtl
 
+    clock = Clock()
+    monkeypatch.setattr("tumortrack_devices.tools.openigtlink.time", clock)
     tool = OpenIgtLinkToolConfig(address="0", std_mm=2.0).open(setting(PublishedFrame()), "slicer")
     client = pyigtl.OpenIGTLinkClient("127.0.0.1", tool.link.port)
     try:
@@ -406,17 +401,28 @@ def test_what_is_drawn_in_slicer_counts_once_it_rests():
 
         places = np.array([(1.0, 2, 130), (3, 4, 131), (5, 6, 132)])
         labels, ras = ["tumor_1", "spot", "tumor_2"], places * [-1, -1, 1]
-        here = np.eye(4)
 
-        def drawn():
-            now = view(time.time_ns(), here)
+        def evidence():
+            now = view(clock.time_ns(), np.eye(4))
             pieces = tool.evidence(now)
             tool.located(now, small_estimate())
             return pieces
 
+        def rested():
+            """What has rested by now, half a second after all that was sent was heard."""
+            points(ras[:1] + 5, ["F-1"], "F")
+
+            def said():
+                assert evidence() == []  # nothing has rested yet
+                return "'F-1'" in tool.trouble  # which is no part
+
+            until(said, "the unknown name")
+            clock.sleep(0.5)
+            return evidence()
+
         for step in (9.0, 6.0, 3.0, 0.0):  # dragged by the mouse
             points(ras + [step, 0, 0], labels, "kidney")
-        given = until(drawn, "touches")
+        given = rested()
         assert [piece.part for piece in given] == ["tumor_1", "kidney", "tumor_2"]
         np.testing.assert_allclose([p.place_mm for p in given], places, atol=1e-5)
         assert {piece.std_mm for piece in given} == {2.0}
@@ -425,19 +431,12 @@ def test_what_is_drawn_in_slicer_counts_once_it_rests():
         ring = np.stack([20 * np.cos(angles), 20 * np.sin(angles), np.full(2000, 120.0)], axis=1)
         surface = pyigtl.PolyDataMessage(points=ring * [-1, -1, 1], device_name="tumor_2")
         client.send_message(surface)
-        (outline,) = until(drawn, "an outline")
+        (outline,) = rested()
         assert isinstance(outline, Outline)
         assert outline.part == "tumor_2"
         assert 30 <= len(outline.places_mm) <= 100
         off_mm = np.linalg.norm(np.array(outline.places_mm)[:, :2], axis=1)
         np.testing.assert_allclose(off_mm, 20, atol=1e-4)
-        points(ras[:1] + 5, ["F-1"], "F")
-
-        def said():
-            tool.evidence(view(time.time_ns(), here))
-            return "'F-1' is drawn, which is no part" in tool.trouble
-
-        until(said, "the unknown name")
     finally:
         client.stop()
         tool.close()
@@ -480,7 +479,7 @@ def test_an_arm_feels_that_it_touches(arm):
         assert felt(tool, arm, 1.9) == []  # less than the threshold
         touch = until(lambda: touched(tool, arm), "a touch")[0]
         np.testing.assert_allclose(touch.place_mm, (0, 0, -20), atol=1e-6)  # base z is -z
-        assert felt(tool, arm, 0.0) == []
+        until(lambda: felt(tool, arm, 0.0) == [], "the release")
         assert until(lambda: touched(tool, arm), "another touch")
     finally:
         tool.close()
@@ -534,9 +533,8 @@ def test_a_tool_of_tf_touches_as_its_topic_says():
             (touch,) = until(touched, "a touch")
             pose = tool_pose(touch.stamp_ns + 50 * MS)
             expected = 1000 * pose[:3, 3] + pose[:3, :3] @ [0, 0, 100]
-            np.testing.assert_allclose(
-                touch.place_mm, expected, atol=10
-            )  # 50 mm/s on a busy machine
+            # Of the poses that have come in a tenth of a second, at 31 mm/s.
+            np.testing.assert_allclose(touch.place_mm, expected, atol=10)
             assert touch.std_mm == 0.7
         finally:
             tool.close()

@@ -177,7 +177,7 @@ def rows_of(tracker: Tracker, scene: Scene, seed: int) -> Iterator[dict[str, Any
         pieces = [piece.evidence for piece in source.drawn(asked.evidence)]
         cloud = _NO_CLOUD if asked.alone else asked.scene.cloud
         try:
-            found = tracker.locate(cloud, 8, 0, asked.seen, pieces)
+            found = tracker.locate(cloud, grid=8, seen=asked.seen, evidence=pieces)
         except NoEstimate:
             continue
         rigid_mm = rigid_centers_mm(model, asked.scene) if number == 0 else {}
@@ -219,7 +219,7 @@ def advice_rows(tracker: Tracker, scene: Scene, seed: int) -> Iterator[dict[str,
     rng = np.random.default_rng([seed, 54])
     scene = hidden(scene, 0.5, rng)
     try:
-        before = tracker.locate(scene.cloud, 8, 0)
+        before = tracker.locate(scene.cloud, grid=8)
     except NoEstimate:
         return
     if before.finding is not None and before.finding.kind not in FAR_OFF:
@@ -243,7 +243,7 @@ def advice_rows(tracker: Tracker, scene: Scene, seed: int) -> Iterator[dict[str,
             pieces = [] if outline is None else [outline]
         then_mm = mine[-1].then_bound_mm
         try:
-            after = tracker.locate(scene.cloud, 8, 0, None, [each.evidence for each in pieces])
+            after = tracker.locate(scene.cloud, grid=8, evidence=[each.evidence for each in pieces])
         except NoEstimate:
             continue
         assert then_mm is not None

@@ -144,7 +144,7 @@ class _Asker:
     def located(self, pieces: Pieces) -> Estimate | None:
         known, scene = [piece.evidence for piece in pieces], self.scene
         try:
-            return self.tracker.locate(scene.cloud, _COARSE, 0, scene.depth, evidence=known)
+            return self.tracker.locate(scene.cloud, grid=_COARSE, seen=scene.depth, evidence=known)
         except NoEstimate:
             return None
 

@@ -135,7 +135,7 @@ def _planned(
         "code": scripting.code_sha256([*code, Path(tumortrack_lab.world.cut.__file__)]),
     }
     methods: dict[str, Locate] = {
-        "model": lambda scene: tracker.locate(scene.cloud, _GRID, 0, scene.depth),
+        "model": lambda scene: tracker.locate(scene.cloud, grid=_GRID, seen=scene.depth),
         "truth": truth,
     }
     for name, (method, locate) in product(made, methods.items()):

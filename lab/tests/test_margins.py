@@ -120,7 +120,7 @@ def test_a_ratio_is_the_farthest_vertex_over_its_bound(ready_case, scenes):
     tracker = Tracker(replace(model, bound_factor=4.0))  # not counted: it would be found anew
     path, row = good_row(Locating(tracker, 0), scenes)
     scene = read_scene(path)
-    found = Tracker(model).locate(scene.cloud, 8, 0, scene.depth)
+    found = Tracker(model).locate(scene.cloud, grid=8, seen=scene.depth)
     ratios = []
     for rest, true, name in zip(
         tracker.anatomy_ct.tumors, scene.reference.tumors, model.parts[1:], strict=True
@@ -164,7 +164,7 @@ def test_a_factor_is_found_kept_and_applied(ready_case, scenes, tmp_path, monkey
     run, bounds = tmp_path / "run", {}
     for name, given in (("with", case), ("without", ready_case)):
         cloud = list_scenes(scenes)[0] / "cloud.ply"
-        answered(tumortrack("locate", given, cloud, run / name, "--device", "cpu"))
+        answered(tumortrack("locate", given, cloud, "--out", run / name, "--device", "cpu"))
         bounds[name] = store.read_json(run / name / "report.json")["assessment"]
     assert bounds["with"]["factor"] == found.factor
     assert bounds["without"]["factor"] == 1.0
@@ -183,7 +183,7 @@ def test_a_factor_is_found_kept_and_applied(ready_case, scenes, tmp_path, monkey
     manifest = store.read_json(model / store.MANIFEST)
     trust = {**manifest["trust"], "std_scale": 1.25}
     store.write_json(model / store.MANIFEST, {**manifest, "trust": trust})
-    said = refusal(tumortrack("locate", case, cloud, tmp_path / "after"))
+    said = refusal(tumortrack("locate", case, cloud, "--out", tmp_path / "after"))
     assert NAME in said
     with pytest.raises(InputError, match="model_sha256"):
         command.run()

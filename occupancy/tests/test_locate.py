@@ -57,7 +57,9 @@ def out(work: Path, seen: tuple[np.ndarray, np.ndarray]) -> Path:
     points, _ = seen
     trimesh.PointCloud(points).export(work / "cloud.ply")
     out = work / "out"
-    said = answered(tumortrack("locate", work / "model", work / "cloud.ply", out, "--grid", 96))
+    said = answered(
+        tumortrack("locate", work / "model", work / "cloud.ply", "--out", out, "--grid", 96)
+    )
     assert "tumor_2" in said
     return out
 
@@ -200,11 +202,11 @@ def test_the_same_seed_gives_the_same_answer_and_distance_does_not_matter(tracke
 def test_clouds_in_other_formats_and_units_agree(work, seen, out):
     points, _ = seen
     np.savez(work / "metres.npz", points=points / 1000)
-    refused = ["locate", work / "model", work / "metres.npz", work / "no"]
+    refused = ["locate", work / "model", work / "metres.npz", "--out", work / "no"]
     for crop in ([], ["--range", "110", "150"]):  # the crop alone would find nothing in range
         assert "--unit m" in refusal(tumortrack(*refused, *crop))
     assert not (work / "no").exists()
-    other = ["locate", work / "model", work / "metres.npz", work / "metres", "--unit", "m"]
+    other = ["locate", work / "model", work / "metres.npz", "--out", work / "metres", "--unit", "m"]
     succeeded(tumortrack(*other, "--grid", 32))
     parts = json.loads((work / "metres" / "report.json").read_text())["parts"]
     before = json.loads((out / "report.json").read_text())["parts"]
@@ -239,7 +241,9 @@ def test_smoothing_needs_a_model_with_a_motion(phantom_case, quick_model, tmp_pa
 
 def test_a_model_without_correspondences_refuses_before_any_work(quick_model, tmp_path):
     line = refusal(
-        tumortrack("locate", quick_model, "no_cloud.ply", tmp_path / "out", "--map", "none.csv")
+        tumortrack(
+            "locate", quick_model, "no_cloud.ply", "--out", tmp_path / "out", "--map", "none.csv"
+        )
     )
     assert "give CASE in place of MODEL" in line
     assert not (tmp_path / "out").exists()
@@ -325,7 +329,7 @@ def test_bad_options_say_what_is_allowed(work, out, tmp_path, arguments, words):
         if torch.cuda.is_available():
             pytest.skip("this machine has a CUDA GPU")
     run = tmp_path / "run"
-    done = tumortrack("locate", work / "model", out / "occupancy.ply", run, *arguments)
+    done = tumortrack("locate", work / "model", out / "occupancy.ply", "--out", run, *arguments)
     assert words in refusal(done)
     if done.returncode == 3:  # no estimate: its page shows the points, and says why
         of_none = {"index.html", "picture.png", "report.json", "manifest.json"}
@@ -376,7 +380,7 @@ def test_scenes_of_another_case_are_refused_and_unknown_ones_are_not(work, scene
 
 def test_depth_images_take_the_range_the_model_was_trained_for(work, scenes):
     scene = scenes / "0000"
-    depth = ["locate", work / "model", scene / "depth.png", work / "depth"]
+    depth = ["locate", work / "model", scene / "depth.png", "--out", work / "depth"]
     assert "--intrinsics" in refusal(tumortrack(*depth))
     depth += ["--intrinsics", scene / "intrinsics.json", "--grid", 48]
     assert "--depth-unit" in refusal(tumortrack(*depth, "--unit", "m"))

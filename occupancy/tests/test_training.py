@@ -76,7 +76,9 @@ def test_a_killed_run_ends_with_the_weights_of_one_that_was_not(case, quick_mode
     model = tmp_path / "killed"
     command = train_command(case, model)
     kill_at_first_checkpoint([*COMMAND, *command, "--checkpoint-every", 0], model)
-    assert "has not ended" in refusal(tumortrack("locate", model, "cloud.ply", model / "out"))
+    assert "has not ended" in refusal(
+        tumortrack("locate", model, "cloud.ply", "--out", model / "out")
+    )
     succeeded(tumortrack(*command))
     assert same_files(model, quick_model, "weights.safetensors")
     assert not (model / "shape.safetensors").exists()

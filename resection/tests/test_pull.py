@@ -281,7 +281,9 @@ def test_a_live_pull_is_followed_planned_on_and_cut(ready_case, tmp_path):
     cloud = organ_points(seen.content, region_for(), Hints(), np.random.default_rng(0)).cloud
     write_cloud_ply(tmp_path / "cloud.ply", cloud.points_mm)
     answered(
-        tumortrack("locate", ready_case, tmp_path / "cloud.ply", tmp_path / "run", "--grid", 64)
+        tumortrack(
+            "locate", ready_case, tmp_path / "cloud.ply", "--out", tmp_path / "run", "--grid", 64
+        )
     )
     (tmp_path / "cell.json").write_text('{"pull_mm": 4}')
     succeeded(

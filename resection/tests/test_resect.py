@@ -619,7 +619,9 @@ def test_a_live_world_that_lies_elsewhere_is_planned_anew_and_cut(
     cloud = cloud_by_rays(case, looking_down(case))
     write_cloud_ply(tmp_path / "cloud.ply", cloud)
     answered(
-        tumortrack("locate", clinic_model, tmp_path / "cloud.ply", tmp_path / "run", "--grid", 32)
+        tumortrack(
+            "locate", clinic_model, tmp_path / "cloud.ply", "--out", tmp_path / "run", "--grid", 32
+        )
     )
     command = ("plan", tmp_path / "run", tmp_path / "plan", "--method", method)
     succeeded(tumortrack(*command, "--accept-poor", "--accept-budget"))

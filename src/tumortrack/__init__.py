@@ -1,7 +1,7 @@
 """tumortrack: an organ and its tumors, located from one depth image of one side.
 
     import tumortrack as tt
-    estimate = tt.Tracker(tt.load_case("CASE")).locate(tt.read_cloud("cloud.ply"))
+    estimate = tt.locate("CASE", tt.read_cloud("cloud.ply"))
 
 Millimetres everywhere; a transform is named ``b_from_a``. See docs/conventions.md. Each name is
 loaded when it is first used: importing this package imports no heavy library.
@@ -29,20 +29,23 @@ if TYPE_CHECKING:
     from tumortrack.io.case import Case as Case
     from tumortrack.io.case import load_case as load_case
     from tumortrack.report.inspection import describe as describe
+    from tumortrack.report.results import Evaluation as Evaluation
+    from tumortrack.report.results import TrackSummary as TrackSummary
     from tumortrack.simulation import datasets as datasets
     from tumortrack.tracking import presets as presets
     from tumortrack.tracking.tracker import Tracker as Tracker
 
 _NAMES = {  # by the module that has them
     "api": "estimate_from_surfaces evaluate export find_organ load_estimate load_model locate "
-    "prepare read_cloud read_depth save_estimate scan_phantom simulate_scenes teach track train "
-    "write_scenes",
+    "locate_files prepare read_cloud read_depth scan_phantom simulate_scenes teach "
+    "track train write_scenes",
     "core": "errors",
     "core.estimate": "Estimate",
     "core.evidence": "Free Held Landmark Outline Touch",
     "core.types": "DepthFrame Intrinsics Look SensorCloud",
     "io.case": "Case load_case",
     "report.inspection": "describe",
+    "report.results": "Evaluation TrackSummary",
     "assessment.advice": "advise",
     "tracking.tracker": "Tracker",
     "simulation": "datasets",

@@ -22,7 +22,8 @@ from jaxtyping import Bool, Float, UInt8
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.types import DepthFrame, Mesh, SensorCloud
+from tumortrack.core.evidence import CAMERA, Evidence
+from tumortrack.core.types import DepthFrame, Look, Mesh, SensorCloud
 from tumortrack.io.case import Case
 from tumortrack.io.case import load_case as load_case
 from tumortrack.tracking.keywords import (
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
     from tumortrack.registration.base_model import Model, ModelConfig
     from tumortrack.registration.method import TrainingStatus
     from tumortrack.report.locating import Located
+    from tumortrack.report.results import Evaluation, TrackSummary
     from tumortrack.segmentation.tissue import TissueClassifier
     from tumortrack.tracking.tracker import Tracker
 
@@ -400,12 +402,42 @@ def teach(
 
 
 def locate(
+    case: Case | Model | StrPath,
+    points: SensorCloud | Float[np.ndarray, "n 3"],
+    *,
+    views: Sequence[Look] = (),
+    evidence: Sequence[Evidence] = (),
+    seen: DepthFrame | SensorCloud | None = None,
+    grid: int = 160,
+    seed: int = 0,
+    frame: str = CAMERA,
+    device: Device = "auto",
+) -> Estimate:
+    """Locate organ and tumors in one cloud; of many clouds ``Tracker`` loads the model once.
+
+    Args:
+        case: a case, a model, or the folder of one.
+        points: of the organ, as the camera sees them: n x 3, camera frame, mm.
+        device: of a folder's model.
+
+    The others, and what is raised, are those of ``Tracker.locate``.
+    """
+    from tumortrack.tracking.tracker import Tracker, cloud_of
+
+    cloud = cloud_of(points)  # what is wrong is said before a model is loaded
+    tracker = Tracker(load_model(case, device) if isinstance(case, str | Path) else case)
+    return tracker.locate(
+        cloud, views=views, evidence=evidence, seen=seen, grid=grid, seed=seed, frame=frame
+    )
+
+
+def locate_files(
     model: StrPath, clouds: StrPath | Sequence[StrPath], **options: Unpack[LocateKeywords]
 ) -> Located:
     """Locate organ and tumors in the file of a cloud or depth image, or in those of several views
-    of the organ at rest, as `tumortrack locate` does; ``Tracker.locate`` takes clouds in memory.
-    Raises InputError, ArtifactError: a file or an option cannot be used, or the model is another
-    patient's than stated.
+    of the organ at rest, as `tumortrack locate` does; ``locate`` takes points in memory. Raises
+    InputError, ArtifactError: a file or an option cannot be used, or the model is another patient's
+    than stated.
 
     Args:
         model: folder of a case, or that ``train`` wrote.
@@ -415,42 +447,20 @@ def locate(
         ``estimate``, which is None where nothing could be located; ``report``, as in report.json;
         ``save(folder, overwrite)`` writes all.
     """
-    from tumortrack.report.locating import locate as locate_files
+    from tumortrack.report import locating
 
     if not isinstance(model, str | Path):
         raise InputError(
-            f"locate takes the folder of a case or model, not {type(model).__name__}: "
-            "locate(FOLDER, FILE), or Tracker(load_case(FOLDER)).locate(cloud)."
+            f"locate_files takes the folder of a case or model, not {type(model).__name__}: "
+            "locate_files(FOLDER, FILE), or locate(case, points)."
         )
     files = [clouds] if isinstance(clouds, str | Path) else clouds
-    asked = options_from(LocateOptions, {**options}, "locate")
-    return locate_files(Path(model), [Path(file) for file in files], asked)
-
-
-def save_estimate(
-    estimate: Estimate,
-    folder: StrPath,
-    overwrite: bool = False,
-    *,
-    cloud: SensorCloud | None = None,
-    seen: DepthFrame | SensorCloud | None = None,
-) -> None:
-    """Write what `tumortrack locate` writes: points, labelled volume, surfaces, report, and a page
-    to look at (index.html, picture.png); camera frame, mm. Raises InputError: the folder exists and
-    ``overwrite`` is False.
-
-    Args:
-        cloud: the organ's points, in which it was located, for the page.
-        seen: all that the camera saw, likewise.
-    """
-    from tumortrack.report.locating import Located
-    from tumortrack.report.seen import Seen
-
-    Located(estimate, seen=Seen(cloud, seen)).save(Path(folder), overwrite)
+    asked = options_from(LocateOptions, {**options}, "locate_files")
+    return locating.locate(Path(model), [Path(file) for file in files], asked)
 
 
 def load_estimate(folder: StrPath) -> Estimate:
-    """Read a folder that ``save_estimate`` or `tumortrack locate` wrote; its ``motion`` is None:
+    """Read a folder that ``Estimate.save`` or `tumortrack locate` wrote; its ``motion`` is None:
     only the model knows that. Raises ArtifactError: no such folder, damaged or changed, or nothing
     was located in it."""
     from tumortrack.io.run_folder import read_estimate
@@ -479,7 +489,7 @@ def evaluate(
     seed: int = 0,
     device: Device = "auto",
     progress: Callable[[], None] | None = None,
-) -> dict[str, Any]:
+) -> Evaluation:
     """Locate in every scene and compare with the truth. Raises InputError: no scenes, one that
     cannot be read or is of another case than the model, or the folder exists and ``overwrite`` is
     False.
@@ -496,12 +506,13 @@ def evaluate(
         progress: called after each scene of a folder.
 
     Returns:
-        The report: per scene and part Hausdorff distances, surface and centre distance (mm), IoU,
-        target errors, and for a tracker of a `clinic` model those of the best rigid pose and of a
-        rigid fit; ``summary`` has medians, and the worst with its scene. docs/conventions.md
-        defines each.
+        Per scene and part Hausdorff distances, surface and centre distance (mm), IoU, target
+        errors, and for a tracker of a `clinic` model those of the best rigid pose and of a rigid
+        fit; ``parts`` and ``errors`` have medians, and the worst with its scene.
+        docs/conventions.md defines each.
     """
     from tumortrack.report import protocol
+    from tumortrack.report.results import evaluation
     from tumortrack.report.rivals import rivals_of
     from tumortrack.report.summary import summarise
     from tumortrack.tracking.tracker import Tracker
@@ -519,11 +530,11 @@ def evaluate(
         folder, out, step = Path(scenes), Path(report), progress or (lambda: None)
         protocol.check_place(out, overwrite)
         if isinstance(locate, Path | Tracker):
-            return protocol.evaluate_model(locate, folder, out, grid, seed, device, step)
+            written = protocol.evaluate_model(locate, folder, out, grid, seed, device, step)
+            return evaluation(written)
         call: Any = getattr(locate, "locate", locate)
-        return protocol.evaluate_scenes(
-            call, folder, out, step, rivals=rivals_of(getattr(locate, "model", None))
-        )
+        rivals = rivals_of(getattr(locate, "model", None))
+        return evaluation(protocol.evaluate_scenes(call, folder, out, step, rivals=rivals))
     if not scenes:
         raise InputError("there are no scenes to evaluate: simulate_scenes(case, 20) makes some.")
     if isinstance(locate, Path):
@@ -533,7 +544,7 @@ def evaluate(
         call = partial(call, grid=grid, seed=seed)
     named = ((f"{n:04d}", scene) for n, scene in enumerate(scenes))
     entries = [protocol.evaluate_scene(call, scene, name, rivals)[0] for name, scene in named]
-    return {"scenes": entries, "summary": summarise(entries)}
+    return evaluation({"scenes": entries, "summary": summarise(entries)})
 
 
 def track(
@@ -545,7 +556,7 @@ def track(
     seconds: float = 0.0,
     range_mm: tuple[float, float] | None = None,
     **options: Unpack[TrackKeywords],
-) -> dict[str, Any]:
+) -> TrackSummary:
     """Follow the organ live, from a source to sinks, until the source ends; returns the run's
     figures: counts, latencies, stage times (docs/conventions.md).
 
@@ -563,6 +574,8 @@ def track(
         InputError: an option, a source or a sink is not written as it must be, or cannot work.
         SourceLost: no frame came for a minute.
     """
+    from tumortrack.report.results import track_summary
+
     run = session(tracker, source, sinks, seconds=seconds, range=range_mm, **options)
     run.loop.warm()
 
@@ -575,7 +588,7 @@ def track(
             for note in worker.notes:  # a viewer's address, or that others can see it
                 logging.getLogger("tumortrack").warning("sink %s: %s", worker.name, note)
         run.run(seen)
-    return run.summary()
+    return track_summary(run.summary())
 
 
 def session(

@@ -48,7 +48,7 @@ def model(slim_model):
 
 @pytest.fixture(scope="module")
 def estimate(model):
-    return Tracker(model).locate(visible(), 16, 0)
+    return Tracker(model).locate(visible(), grid=16)
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +119,7 @@ def test_a_bound_that_is_mostly_of_depths_says_so(one_place, depth_share, kind):
 
 
 def test_a_models_factor_multiplies_the_bounds_of_its_answers(model, estimate):
-    found = Tracker(replace(model, bound_factor=1.25)).locate(visible(), 16, 0)
+    found = Tracker(replace(model, bound_factor=1.25)).locate(visible(), grid=16)
     assert found.assessment.factor == 1.25
     for name, plain in estimate.assessment.bounds.items():
         times = found.assessment.bounds[name].error_bound95_mm / plain.error_bound95_mm
@@ -158,7 +158,7 @@ def test_of_several_cameras_the_worst_counts_and_one_that_nobody_stated(model):
         error = None if second is None else DepthError(second)
         look = Look(replace(cloud, depth_error=error), cloud, np.eye(4))
         mine = replace(cloud, depth_error=DepthError(first))
-        found = tracker.locate(mine, 16, 0, evidence=[look])
+        found = tracker.locate(mine, views=[look], grid=16)
         shares[first, second] = found.report.motion.depth_share
     assert shares[0.0, 0.0] == 0
     assert shares[0.0, 3.0] == pytest.approx(shares[3.0, 0.0])

@@ -123,7 +123,7 @@ def test_another_patients_organ_is_named_as_such_unless_noise_is_large(tracker, 
         assert causes[0].cause is Cause.ANOTHER_PATIENT
         assert words(causes[:1], "").split(";")[0] in reason
     cloud = SensorCloud(places.astype(np.float32), noise=PointNoise(1.6, 0.3, 0.01))
-    causes = likely_causes(tracker.model, cloud, tracker.locate(cloud, 16))
+    causes = likely_causes(tracker.model, cloud, tracker.locate(cloud, grid=16))
     assert (causes[0].cause, causes[0].number) == (Cause.NOISE, 1.6)
     assert Cause.ANOTHER_PATIENT not in [one.cause for one in causes]
 

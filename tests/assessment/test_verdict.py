@@ -306,7 +306,7 @@ def test_train_and_inspect_say_what_speaks_against_a_model(clinic_model):
 def test_locate_says_its_verdict_and_plan_heeds_it(tmp_path, phantom_case, clinic_model):
     succeeded(tumortrack("simulate", phantom_case, tmp_path / "scenes", "--scenes", 1))
     run, cloud = tmp_path / "run", tmp_path / "scenes" / "0000" / "cloud.ply"
-    done = tumortrack("locate", clinic_model, cloud, run, "--device", "cpu")
+    done = tumortrack("locate", clinic_model, cloud, "--out", run, "--device", "cpu")
     said, quality = answered(done), store.read_json(run / "report.json")["quality"]
     assert done.returncode == {"good": 0, "poor": 4}[quality["verdict"]]
     assert said.startswith(f"{quality['verdict']}: ")

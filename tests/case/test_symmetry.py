@@ -71,7 +71,10 @@ def test_prepare_says_it_and_inspect_repeats_it(tmp_path, models_at_once, capsys
     (tmp_path / "meshes").mkdir()
     write_anatomy(tmp_path / "meshes", bent(organ(), share))
     case = tmp_path / "case"
-    for command in (["prepare", str(tmp_path / "meshes"), str(case)], ["inspect", str(case)]):
+    for command in (
+        ["prepare", str(tmp_path / "meshes"), "--out", str(case)],
+        ["inspect", str(case)],
+    ):
         assert run(command) == 0
         assert ("half a turn" in capsys.readouterr().out) == says
     report = store.read_json(case / store.MANIFEST)["report"]

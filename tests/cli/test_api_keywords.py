@@ -29,7 +29,7 @@ def test_what_an_editor_offers_is_what_the_function_takes(typed, options):
     assert get_type_hints(typed).keys() == get_type_hints(options).keys()
 
 
-@pytest.mark.parametrize("call", [tt.prepare, tt.write_scenes, tt.export, tt.locate])
+@pytest.mark.parametrize("call", [tt.prepare, tt.write_scenes, tt.export, tt.locate_files])
 def test_an_unknown_keyword_is_named_with_the_known_ones(call, tmp_path):
     with pytest.raises(tt.errors.InputError, match=r"'gird'.*(seed|series)"):
         call(tmp_path, tmp_path / "out", gird=3)

@@ -36,7 +36,7 @@ def _ball(value: int = 1) -> np.ndarray:
 def test_a_map_without_the_organ_leaves_nothing(tmp_path):
     """Damaged files: the attacks."""
     source = _nifti(tmp_path / "tumor.nii", _ball(2).astype(np.uint8))
-    refusal(tumortrack("prepare", source, tmp_path / "case"))
+    refusal(tumortrack("prepare", source, "--out", tmp_path / "case"))
     assert list(tmp_path.iterdir()) == [source]
 
 
@@ -57,7 +57,7 @@ def test_a_map_without_the_organ_leaves_nothing(tmp_path):
 )
 def test_options_out_of_range_say_what_is_allowed(arguments, words, tmp_path, capsys):
     source = _nifti(tmp_path / "ball.nii", 1000 * _ball() - 900)
-    assert run(["prepare", str(source), str(tmp_path / "case"), *arguments]) == 2
+    assert run(["prepare", str(source), "--out", str(tmp_path / "case"), *arguments]) == 2
     assert words in capsys.readouterr().err
     assert not (tmp_path / "case").exists()
 
@@ -65,7 +65,7 @@ def test_options_out_of_range_say_what_is_allowed(arguments, words, tmp_path, ca
 @pytest.mark.parametrize(("name", "value"), [("rotations", "any"), ("sensor", "kinect")])
 @pytest.mark.usefixtures("unchecked")
 def test_a_choice_that_is_none_is_refused(name, value, tmp_path):
-    done = tumortrack("prepare", "ball.nii", tmp_path / "case", f"--{name}", value)
+    done = tumortrack("prepare", "ball.nii", "--out", tmp_path / "case", f"--{name}", value)
     assert done.returncode == 2
     assert value in done.stderr
     with pytest.raises(InputError, match=f"{name} '{value}'"):
@@ -98,7 +98,7 @@ def test_an_unreadable_input_is_named_and_no_folder_stays(tmp_path, monkeypatch)
 
     monkeypatch.setattr("tumortrack.io.volume.read_raw", refuse)
     with pytest.raises(InputError, match=r"ball\.nii"):
-        Prepare(input=source, case=tmp_path / "new" / "dir" / "case").run()
+        Prepare(input=source, out=tmp_path / "new" / "dir" / "case").run()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["ball.nii"]
 
 

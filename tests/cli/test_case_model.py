@@ -48,7 +48,7 @@ def ended(folder: Path) -> list[str]:
 def test_the_first_command_makes_it_and_all_others_take_it(case, cloud, tmp_path):
     assert "its model: none yet" in "\n".join(describe(case))
     run_folder, model = tmp_path / "run", case / "model"
-    assert MAKING in answered(tumortrack("locate", case, cloud, run_folder, "--grid", 32))
+    assert MAKING in answered(tumortrack("locate", case, cloud, "--out", run_folder, "--grid", 32))
     made = store.sha256_of(model)
     report = store.read_json(run_folder / "report.json")
     assert report["model_sha256"] == store.sha256_of(model / store.MANIFEST)
@@ -92,7 +92,7 @@ def test_an_interrupted_making_leaves_nothing(
 
     with monkeypatch.context() as patch:
         patch.setattr(model_files, at, stop)
-        assert run(["locate", str(case), str(cloud), str(tmp_path / "run")]) == 130
+        assert run(["locate", str(case), str(cloud), "--out", str(tmp_path / "run")]) == 130
         assert store.sha256_of(case) == before
         assert ended(case) == sorted(path.name for path in case.iterdir())
         new = tmp_path / "new"
@@ -139,7 +139,7 @@ def test_a_case_is_replaced_with_its_model_and_with_nothing_else(
     models_at_once, case, tmp_path, capsys
 ):
     new = tmp_path / "new"
-    command = ["prepare", str(case / "labels.nii.gz"), str(new)]
+    command = ["prepare", str(case / "labels.nii.gz"), "--out", str(new)]
     assert run(command) == 0
     before = (new / "manifest.json").read_bytes()
     assert run(command) == 2
@@ -194,7 +194,9 @@ def test_prepare_says_that_a_ball_does_not_show_how_it_lies(tmp_path):
     labels = (np.linalg.norm(index - 28, axis=-1) < 24).astype(np.uint8)
     labels[np.linalg.norm(index - [40, 28, 28], axis=-1) < 7] = 2
     write_nifti(tmp_path / "ball.nii.gz", labels, np.diag([1.5, 1.5, 1.5, 1.0]), lps=True)
-    said = tumortrack("prepare", tmp_path / "ball.nii.gz", tmp_path / "case", "--rotations", "full")
+    said = tumortrack(
+        "prepare", tmp_path / "ball.nii.gz", "--out", tmp_path / "case", "--rotations", "full"
+    )
     weakness = weakness_of(read_model_manifest(tmp_path / "case" / "model")["provenance"])
     assert weakness
     assert f"note: {weakness}" in succeeded(said).splitlines()

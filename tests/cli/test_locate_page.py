@@ -60,7 +60,7 @@ def test_a_depth_image_of_any_size_has_its_page(size, clinic_model, phantom_case
     frame = make_scene(organ, HAND, np.random.default_rng(3), camera).frame
     write_frame_folder(tmp_path / "scene", frame)
     paths = {"intrinsics": (tmp_path / "scene" / "intrinsics.json",)}
-    tt.locate(clinic_model, tmp_path / "scene" / "depth.png", grid=32, **paths).save(
+    tt.locate_files(clinic_model, tmp_path / "scene" / "depth.png", grid=32, **paths).save(
         str(tmp_path / "run")
     )
     assert (tmp_path / "run" / PAGE).is_file()
@@ -68,7 +68,16 @@ def test_a_depth_image_of_any_size_has_its_page(size, clinic_model, phantom_case
 
 def test_the_organ_is_found_in_a_raw_depth_image(raw, clinic_model, phantom_case):
     def locate(image, *options):
-        command = ("locate", clinic_model, raw / image, raw / "run", "--grid", 32, "--overwrite")
+        command = (
+            "locate",
+            clinic_model,
+            raw / image,
+            "--out",
+            raw / "run",
+            "--grid",
+            32,
+            "--overwrite",
+        )
         return tumortrack(*command, "--intrinsics", raw / "camera.json", *options)
 
     said = answered(done := locate("depth.png"))
@@ -109,7 +118,7 @@ def test_the_organ_is_found_in_a_raw_depth_image(raw, clinic_model, phantom_case
 
 
 def test_without_an_estimate_there_is_a_page_that_says_why(raw, clinic_model):
-    command = ("locate", clinic_model, raw / "depth.png", raw / "run", "--grid", 32)
+    command = ("locate", clinic_model, raw / "depth.png", "--out", raw / "run", "--grid", 32)
     command = (*command, "--intrinsics", raw / "camera.json")
     line = refusal(done := tumortrack(*command, "--at", 5, 5))
     assert done.returncode == 3
@@ -138,7 +147,7 @@ def test_the_verdict_is_said_before_anything_is_written(raw, clinic_model, monke
         raise StorageError("the disk is full.")
 
     monkeypatch.setattr("tumortrack.io.run_folder.write_estimate", full)
-    command = ("locate", clinic_model, raw / "depth.png", raw / "run")
+    command = ("locate", clinic_model, raw / "depth.png", "--out", raw / "run")
     command = (*command, "--intrinsics", raw / "camera.json")
     assert run([str(part) for part in command]) == StorageError.exit_code == 2
     assert said[0].startswith("good: ")

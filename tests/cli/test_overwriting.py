@@ -29,10 +29,10 @@ OF_SCRIPTS = {"scripting.py"}  # of lab/scripts
 MINE = "of the user's own"
 # Every command that writes, with what it needs before it looks at where it is to write.
 COMMANDS = {
-    "prepare": "CASE OUT",
+    "prepare": "CASE --out OUT",
     "export": "CASE OUT",
     "train": "CASE OUT",
-    "locate": "NONE NONE OUT",
+    "locate": "NONE NONE --out OUT",
     "plan": "NONE OUT",
     "onnx": "NONE OUT.onnx",
     "demo": "--out OUT",

@@ -24,7 +24,7 @@ def run(phantom_case, clinic_model, tmp_path_factory):
     folder = tmp_path_factory.mktemp("patient")
     case = load_case(phantom_case)
     write_cloud_ply(folder / "cloud.ply", cloud_by_rays(case, looking_down(case)))
-    command = ("locate", clinic_model, folder / "cloud.ply", folder / "run", "--grid", 32)
+    command = ("locate", clinic_model, folder / "cloud.ply", "--out", folder / "run", "--grid", 32)
     said = answered(tumortrack(*command, "--patient", "P1", "--side", "right"))
     assert "patient P1, right side" in said
     return folder / "run"
@@ -47,7 +47,7 @@ def test_they_travel_from_the_case_to_model_run_and_plan(phantom_case, clinic_mo
 def test_another_patient_or_side_than_stated_stops(clinic_model, run, tmp_path, stated):
     cloud, place = run.parent / "cloud.ply", tmp_path / "new"
     for command in (
-        ("locate", clinic_model, cloud, place),
+        ("locate", clinic_model, cloud, "--out", place),
         ("track", clinic_model, "virtual:nowhere", f"recording:{place}"),
         ("plan", run, place, "--no-arms", "--accept-poor"),
     ):
@@ -91,7 +91,7 @@ def test_folders_that_say_nothing_know_nobody_and_serve_nobody_in_particular(
     del report["patient"]
     (old / "report.json").write_text(json.dumps(report))
     store.seal(old, "run", {"report": "report.json"}, "camera")
-    locate = ("locate", model, run.parent / "cloud.ply", tmp_path / "new", "--grid", 32)
+    locate = ("locate", model, run.parent / "cloud.ply", "--out", tmp_path / "new", "--grid", 32)
     plan = ("plan", old, tmp_path / "plan", "--no-arms", "--accept-poor", "--accept-budget")
     for command in (locate, plan):
         line = refusal(tumortrack(*command, "--patient", "P1"))

@@ -22,7 +22,7 @@ def locates_its_organ(case: Path, folder: Path) -> None:
     """Simulate a scene, locate in it: the organ is where it is."""
     succeeded(tumortrack("simulate", case, folder / "scenes", "--scenes", 1))
     cloud = folder / "scenes" / "0000" / "cloud.ply"
-    answered(tumortrack("locate", case, cloud, folder / "out", "--grid", 48))
+    answered(tumortrack("locate", case, cloud, "--out", folder / "out", "--grid", 48))
     kidney = json.loads((folder / "out" / "report.json").read_text())["parts"]["kidney"]
     truth = read_mesh(cloud.with_name("kidney.ply")).box_mm.mean(0)
     assert np.linalg.norm(np.array(kidney["center_mm"]) - truth) < 5
@@ -33,7 +33,7 @@ def test_label_map_to_located_organ(shared_data, tmp_path):
     """All the way; from a CT the demo goes there. More patients: ``test_imaging_prepare``."""
     case = tmp_path / "case"
     source = shared_data / "kits19" / "case_00000" / "segmentation.nii.gz"
-    succeeded(tumortrack("prepare", source, case))
+    succeeded(tumortrack("prepare", source, "--out", case))
     anatomy = load_case(case).anatomy
     assert anatomy.organ.volume_mm3 / 1000 == pytest.approx(215, rel=0.02)
     assert [t.volume_mm3 / 1000 for t in anatomy.tumors] == pytest.approx([7.8], rel=0.02)
@@ -45,7 +45,7 @@ def test_label_map_to_located_organ(shared_data, tmp_path):
 def test_virtual_ct_gives_back_the_anatomy(patient, shared_data, models_at_once, tmp_path):
     true = prepare(shared_data / "kits19" / patient / "segmentation.nii.gz")
     write_dicom_series(scan(true.labels, ScannerParameters(), 4), tmp_path / "dicom")
-    assert run(["prepare", str(tmp_path / "dicom"), str(tmp_path / "ct_case")]) == 0
+    assert run(["prepare", str(tmp_path / "dicom"), "--out", str(tmp_path / "ct_case")]) == 0
     prepared = load_case(tmp_path / "ct_case").anatomy
     assert len(prepared.parts) == len(true.anatomy.parts)
     for mine, theirs in zip(prepared.parts, true.anatomy.parts, strict=True):
@@ -58,7 +58,7 @@ def test_virtual_ct_gives_back_the_anatomy(patient, shared_data, models_at_once,
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_a_kidney_without_tumor_from_a_mask(side, shared_data, models_at_once, tmp_path, capsys):
     source = shared_data / "totalsegmentator" / f"kidney_{side}.nii.gz"
-    assert run(["prepare", str(source), str(tmp_path / "case")]) == 0
+    assert run(["prepare", str(source), "--out", str(tmp_path / "case")]) == 0
     assert "tumor" in capsys.readouterr().out  # told that there is none
     anatomy = load_case(tmp_path / "case").anatomy
     assert anatomy.names == ("kidney",)
@@ -72,7 +72,7 @@ def test_a_kidney_without_tumor_from_a_mask(side, shared_data, models_at_once, t
 @pytest.mark.slow
 def test_a_body_ct_by_thresholds_is_refused_with_advice(shared_data, tmp_path):
     ct = shared_data / "totalsegmentator" / "example_ct.nii.gz"
-    assert "--labels" in refusal(tumortrack("prepare", ct, tmp_path / "case"))
+    assert "--labels" in refusal(tumortrack("prepare", ct, "--out", tmp_path / "case"))
     assert not (tmp_path / "case").exists()
 
 
@@ -80,6 +80,6 @@ def test_a_body_ct_by_thresholds_is_refused_with_advice(shared_data, tmp_path):
 def test_real_compressed_dicom_is_read_and_refused_for_what_it_is(shared_data, tmp_path):
     """20 slices of an abdomen hold no whole kidney: read, then told so; nothing is written."""
     folder: Path = shared_data / "totalsegmentator" / "example_ct_dicom"
-    message = refusal(tumortrack("prepare", folder, tmp_path / "case"))
+    message = refusal(tumortrack("prepare", folder, "--out", tmp_path / "case"))
     assert "kidney" in message
     assert list(tmp_path.iterdir()) == []

@@ -12,6 +12,8 @@ import pytest
 
 from stories import cloud_by_rays, looking_down, with_imports
 from tumortrack.cli import main
+from tumortrack.cli.console import inputs_and_out
+from tumortrack.core.errors import InputError
 from tumortrack.io.case import load_case
 from tumortrack.io.ply import write_cloud_ply
 
@@ -27,13 +29,15 @@ def cloud(tmp_path, phantom_case):
 @pytest.mark.parametrize(
     ("command", "wrong"),
     [
-        ("locate NONE CLOUD OUT", "NONE"),
-        ("locate MODEL NONE.ply OUT", "NONE.ply"),
-        ("locate MODEL CLOUD CLOUD", "CLOUD"),
+        ("locate NONE CLOUD --out OUT", "NONE"),
+        ("locate MODEL NONE.ply --out OUT", "NONE.ply"),
+        ("locate MODEL CLOUD --out CLOUD", "CLOUD"),
         ("track NONE virtual:CASE --report OUT", "NONE"),
         ("track MODEL virtual:NONE --report OUT", "NONE"),
-        ("locate CLOUD MODEL OUT", "tumortrack locate MODEL CLOUD OUT"),
-        ("locate MODEL CASE OUT", "CASE"),
+        ("locate CLOUD MODEL --out OUT", "tumortrack locate MODEL CLOUD --out OUT"),
+        ("locate MODEL CASE --out OUT", "CASE"),
+        ("locate MODEL CLOUD", "--out"),
+        ("locate MODEL NONE.ply OUT", "NONE.ply"),  # as it was once
         ("evaluate MODEL NONE OUT", "NONE"),
         ("train NONE OUT", "NONE"),
     ],
@@ -52,13 +56,27 @@ def test_what_is_wrong_is_said_before_pytorch_is_loaded(
     assert not (tmp_path / "out").exists()
 
 
+def test_the_last_of_several_paths_was_once_the_folder_to_write(tmp_path, capsys):
+    first, second, out = (tmp_path / name for name in ("a.ply", "b.ply", "run"))
+    assert inputs_and_out((first, second), out, "") == ((first, second), out)
+    assert capsys.readouterr().err == ""
+    assert inputs_and_out((first, second, out), None, "") == ([first, second], out)
+    (note,) = capsys.readouterr().err.splitlines()
+    assert note.startswith("note: ")
+    assert str(out) in note
+    with pytest.raises(InputError):
+        inputs_and_out((first,), None, "")
+
+
 def test_an_answer_needs_none_of_the_slow_libraries(slim_model, tmp_path):
     from warp_objects import placed
 
     surface = placed(3).carry(placed(3).shape.anatomy_ct.organ.vertices_mm)
     file = tmp_path / "cloud.ply"
     write_cloud_ply(file, surface[surface[:, 2] < np.median(surface[:, 2])].astype(np.float32))
-    done, imported = with_imports("locate", slim_model, file, tmp_path / "out", "--grid", 32)
+    done, imported = with_imports(
+        "locate", slim_model, file, "--out", tmp_path / "out", "--grid", 32
+    )
     assert done.returncode in (0, 4), done.stderr[-2000:]
     assert (tmp_path / "out" / "labels.nii.gz").exists()
     assert "written to" in done.stdout.splitlines()[-1]  # though the process ends at once

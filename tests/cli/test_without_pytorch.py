@@ -84,7 +84,7 @@ def test_a_phantom_is_prepared_and_located(phantom_case, tmp_path):
     known, file = load_case(phantom_case), tmp_path / "cloud.ply"
     write_cloud_ply(file, cloud_by_rays(known, looking_down(known), 0.02).astype("float32"))
     case, run = tmp_path / "case", tmp_path / "run"
-    succeeded(without_pytorch(COMMAND, "prepare", phantom_case / "labels.nii.gz", case))
-    said = answered(without_pytorch(COMMAND, "locate", case, file, run, "--grid", 48))
+    succeeded(without_pytorch(COMMAND, "prepare", phantom_case / "labels.nii.gz", "--out", case))
+    said = answered(without_pytorch(COMMAND, "locate", case, file, "--out", run, "--grid", 48))
     assert "tumor_2: centre" in said
     assert (run / "index.html").exists()

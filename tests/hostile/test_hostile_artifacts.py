@@ -44,7 +44,7 @@ def model(change: Change, then: Change = lambda model: None, kind: str = "model"
     def make(room: Room) -> list[object]:
         changed = resealed(room, kind, change)
         then(changed)
-        return ["locate", changed, room.cloud, room.out, *CPU]
+        return ["locate", changed, room.cloud, "--out", room.out, *CPU]
 
     return make
 
@@ -130,7 +130,7 @@ def case_with_a_damaged_model(room: Room) -> list[object]:
     shutil.copytree(room.base / "case", case, ignore=shutil.ignore_patterns("model"))
     shutil.copytree(room.base / "model", case / "model")
     cut(case / "model")
-    return ["locate", case, room.cloud, room.out]
+    return ["locate", case, room.cloud, "--out", room.out]
 
 
 def surer(value: Any) -> Any:

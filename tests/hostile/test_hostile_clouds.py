@@ -26,7 +26,7 @@ def with_model(*arguments: Any) -> Make:
 
     def make(room: Room) -> list[object]:
         views, *options = (each(room) if callable(each) else each for each in arguments)
-        return ["locate", room.base / "model", views, room.out, *options, *CPU]
+        return ["locate", room.base / "model", views, "--out", room.out, *options, *CPU]
 
     return make
 
@@ -127,7 +127,13 @@ def npz_bomb() -> bytes:
         "is_a_fifo": with_model(lambda room: room.fifo("in.ply")),
         "without_end": with_model(lambda room: room.endless("in.ply")),
         "name_of_300_bytes": with_model("x" * 300 + ".ply"),
-        "model_name_of_300_bytes": lambda room: ["locate", "x" * 300, room.cloud, room.out],
+        "model_name_of_300_bytes": lambda room: [
+            "locate",
+            "x" * 300,
+            room.cloud,
+            "--out",
+            room.out,
+        ],
         "map_is_a_fifo": option("--map", lambda room: room.fifo("map.csv")),
         "map_at_1e300": option("--map", lambda room: room.file("map.csv", b"x,y,z\n1e300,0,0\n")),
         "seed_of_100_bits": option("--seed", lambda room: 10**30),
@@ -177,7 +183,7 @@ def views(*poses: object) -> Make:
         given = {"fixed_from_camera": poses, "unit": "mm", "frame_id": "base_link"}
         written = room.file("poses.json", json.dumps(given).encode())
         clouds = (room.cloud, room.cloud)
-        return ["locate", room.base / "model", *clouds, room.out, "--poses", written, *CPU]
+        return ["locate", room.base / "model", *clouds, "--out", room.out, "--poses", written, *CPU]
 
     return make
 

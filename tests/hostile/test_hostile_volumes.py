@@ -28,7 +28,14 @@ def room(tmp_path, monkeypatch):
 
 
 def file(content: Callable[[], bytes], name: str = "in.nii.gz", *options: object) -> Make:
-    return lambda room: ["prepare", room.file(name, content()), room.out, "--labels", *options]
+    return lambda room: [
+        "prepare",
+        room.file(name, content()),
+        "--out",
+        room.out,
+        "--labels",
+        *options,
+    ]
 
 
 def header(form: str, offset: int, *values: object) -> Make:
@@ -127,15 +134,15 @@ def detached_data(room: Room) -> list[object]:
 
 def target(*names: str) -> Make:
     """A right volume, and a folder that cannot be made."""
-    return lambda room: [*header("<B", 123, 2)(room)[:2], room.folder.joinpath(*names), "--labels"]
+    return lambda room: [*header("<B", 123, 2)(room)[:3], room.folder.joinpath(*names), "--labels"]
 
 
 def names_in_latin1(room: Room) -> list[object]:
     """Names that are no UTF-8, of input and target: used as they are, or refused."""
-    _, volume, _, option = header("<B", 123, 2)(room)
+    _, volume, _, _, option = header("<B", 123, 2)(room)
     other = room.folder / os.fsdecode(b"sch\xf6n.nii")
     os.rename(str(volume), other)
-    return ["prepare", other, room.folder / os.fsdecode(b"f\xfcr"), option]
+    return ["prepare", other, "--out", room.folder / os.fsdecode(b"f\xfcr"), option]
 
 
 METAIMAGE = (
@@ -174,9 +181,14 @@ METAIMAGE = (
         "nrrd_detached_data": detached_data,
         "nrrd_claims_terabytes": nrrd_file("30000 30000 30000", "encoding: raw"),
         "mha_names_another_file": file(lambda: METAIMAGE, "in.mha"),
-        "volume_is_a_fifo": lambda room: ["prepare", room.fifo("in.nii.gz"), room.out],
-        "volume_without_end": lambda room: ["prepare", room.endless("in.nii"), room.out],
-        "name_of_300_bytes": lambda room: ["prepare", room.folder / ("x" * 300 + ".nii"), room.out],
+        "volume_is_a_fifo": lambda room: ["prepare", room.fifo("in.nii.gz"), "--out", room.out],
+        "volume_without_end": lambda room: ["prepare", room.endless("in.nii"), "--out", room.out],
+        "name_of_300_bytes": lambda room: [
+            "prepare",
+            room.folder / ("x" * 300 + ".nii"),
+            "--out",
+            room.out,
+        ],
         "target_of_300_bytes": target("x" * 300),
         "target_below_a_file": target("in.nii", "out"),
     },
@@ -217,7 +229,7 @@ def dicom(
         for dataset in slices:
             dataset.save_as(dataset.filename)
         of_files([path for path in paths if path.exists()])
-        return ["prepare", series, room.out]
+        return ["prepare", series, "--out", room.out]
 
     return make
 
@@ -342,7 +354,7 @@ def meshes(parts: Callable[[], dict[str, Any]], fifo: str = "") -> Make:
                 part.export(folder / f"{name}.stl")
         if fifo:
             room.fifo(f"meshes/{fifo}")
-        return ["prepare", folder, room.out]
+        return ["prepare", folder, "--out", room.out]
 
     return make
 

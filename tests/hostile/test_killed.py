@@ -75,7 +75,7 @@ class Place:
 
     def locate(self, out: Path) -> Words:
         cloud = self.base / "scenes" / "0000" / "cloud.ply"
-        return ("locate", self.base / "model", cloud, out, "--device", "cpu")
+        return ("locate", self.base / "model", cloud, "--out", out, "--device", "cpu")
 
     def train(self, name: str, steps: int = 12) -> Words:
         options = ("--steps", steps, "--seed", 1, "--workers", 0, "--device", "cpu")
@@ -191,10 +191,10 @@ def stamps_of(tape: Path) -> list[int]:
 
 WORLD = "virtual:{base}/case?breathing=false&instrument=false&camera_motion=false&fps=10"
 LONG_COMMANDS = [
-    "prepare {base}/case/labels.nii.gz {out}",
+    "prepare {base}/case/labels.nii.gz --out {out}",
     "simulate {base}/case {out} --scenes 8",
     "train {base}/case {out}",
-    "locate {base}/model {base}/scenes/0000/cloud.ply {out}",
+    "locate {base}/model {base}/scenes/0000/cloud.ply --out {out}",
     "evaluate {base}/model {base}/scenes {out}",
     f"track {{base}}/case {WORLD} viewer:0 openigtlink:0 recording:{{out}} --seconds 8",
     "export {base}/case {out}",

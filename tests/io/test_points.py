@@ -310,7 +310,7 @@ class Knowing:
     def __init__(self, model, advise):
         pass
 
-    def locate(self, cloud, grid, seed, seen, evidence, frame):
+    def locate(self, points, **options):
         Knowing.asked += 1
         return located(Wave(sure=True))
 
@@ -354,4 +354,4 @@ def test_python_takes_the_commands_options(slim_model, cloud, tmp_path):
         ([cloud], {"intrinsics": ["a.json", "b.json"]}, "2 times"),
     ):
         with pytest.raises(InputError, match=named):
-            tt.locate(str(slim_model), cloud_of, **options)
+            tt.locate_files(str(slim_model), cloud_of, **options)

@@ -166,9 +166,9 @@ def test_what_is_no_organ_gives_no_estimate_and_no_old_one(tracker, stages):
 
 def test_only_an_organ_found_good_a_moment_ago_may_have_been_turned_over(tracker, stages):
     class Watched(Tracker):
-        def follow(self, cloud, last=None, how=FollowOptions(), seen=None, evidence=()):  # noqa: B008
+        def follow(self, cloud, last=None, how=FollowOptions(), seen=None, **known):  # noqa: B008
             asked.append(how.either_side)
-            found = super().follow(cloud, last, how, seen, evidence)
+            found = super().follow(cloud, last, how, seen, **known)
             return found.assessed(finding=None if verdicts.pop(0) == "good" else poor("hidden"))
 
     asked, verdicts = [], ["poor", "good", "poor", "poor", "poor", "poor"]

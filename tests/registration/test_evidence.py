@@ -151,7 +151,7 @@ def test_many_that_agree_outvote_what_contradicts_them(tracker, agree, wrong, de
     away = np.array(at(BEHIND[0])) + [0, 0, 25.0]
     false = [Touch(place_mm=tuple(away + [3.0 * n, 0, 0])) for n in range(wrong)]
     cloud, right = SensorCloud(SEEN.astype(np.float32)), touches(agree)
-    found = tracker.locate(cloud, 16, 0, evidence=[*right, *false])
+    found = tracker.locate(cloud, grid=16, evidence=[*right, *false])
     told = found.report.evidence
     assert [each.left_out for each in told] == [False] * agree + [True] * wrong
     assert (found.finding is not None and found.finding.kind == "evidence") == decides
@@ -161,7 +161,7 @@ def test_many_that_agree_outvote_what_contradicts_them(tracker, agree, wrong, de
     assert told[agree].news == pytest.approx(0, abs=1e-9)
     assert told[agree].places_mm == (tuple(away),)
     assert all(0 < each.news <= 1 for each in told[:agree])
-    rest = tracker.locate(cloud, 16, 0, evidence=right)
+    rest = tracker.locate(cloud, grid=16, evidence=right)
     apart = found.motion.carry(VERTICES) - rest.motion.carry(VERTICES)
     assert np.linalg.norm(apart, axis=1).max() < 0.5
 
@@ -212,10 +212,11 @@ def test_many_touches_of_another_place_are_named_where_the_organ_is_not_found(tr
     cloud = stamped(sides(TRUE), 0)
     away = [Touch(place_mm=tuple(TRUE.centre_mm + [0, 0, -35.0]), std_mm=0.05)] * 60
     with pytest.raises(NotThisOrgan, match="evidence"):
-        tracker.locate(cloud, 16, evidence=away)
-    tracker.locate(cloud, 16)
+        tracker.locate(cloud, grid=16, evidence=away)
+    tracker.locate(cloud, grid=16)
+    many = Outline(places_mm=(TRUE.centre_mm,) * 1002, part="")
     with pytest.raises(InputError, match=r"1002 .* 1000"):
-        tracker.locate(cloud, 16, evidence=[Outline(places_mm=(TRUE.centre_mm,) * 1002, part="")])
+        tracker.locate(cloud, evidence=[many])
 
 
 @pytest.mark.parametrize(("away_s", "known"), [(5.0, 14), (70.0, 0)])
@@ -263,7 +264,7 @@ def test_touched_places_are_carried_as_the_tissue_goes():
 
 
 def test_what_a_tool_holds_is_where_the_tool_is_until_it_slips(tracker):
-    first = tracker.locate(stamped(sides(TRUE), 0), 16)
+    first = tracker.locate(stamped(sides(TRUE), 0), grid=16)
     tip_mm = BEHIND[np.linalg.norm(BEHIND - TUMOR.mean(0), axis=1).argmin()]
     errors = {}
     for kind in ("nothing", "held"):
@@ -377,7 +378,19 @@ def test_touches_alone_are_an_answer(slim_model, tmp_path):
     evidence = [Touch(place_mm=tuple(p), tip_mm=1.5) for p in tips]
     file, out = tmp_path / "e.json", tmp_path / "out"
     file.write_bytes(evidence_json((*evidence, *this_way_round())))
-    command = "locate", slim_model, "-", out, "--grid", 32, "--device", "cpu", "--evidence", file
+    command = (
+        "locate",
+        slim_model,
+        "-",
+        "--out",
+        out,
+        "--grid",
+        32,
+        "--device",
+        "cpu",
+        "--evidence",
+        file,
+    )
     said = answered(tumortrack(*command))
     assert "no cloud: the organ was touched alone" in said
     report = json.loads((out / "report.json").read_text())
@@ -413,7 +426,7 @@ def test_outlines_alone_are_an_answer_and_their_stated_error_counts(tracker):
     stds = {}
     for std_mm, shared_mm in ((0.3, 0.0), (3.0, 0.0), (0.3, 3.0)):
         told = planes(12, std_mm=std_mm, shared_std_mm=shared_mm, tool="probe")
-        found = tracker.locate(NOTHING, 16, 0, evidence=[*told, *this_way_round()])
+        found = tracker.locate(NOTHING, grid=16, evidence=[*told, *this_way_round()])
         tumor = found.report.parts["tumor_1"]
         assert np.linalg.norm(np.array(tumor.center_mm) - at_all(TUMOR).mean(0)) < 2
         assert found.report.motion.depth_share == 0  # no camera
@@ -428,8 +441,8 @@ def shifted(pieces, by_mm):
 
 def test_in_a_frame_of_its_own_evidence_has_its_answer_there(tracker, slim_model, tmp_path):
     away_mm, told = np.array([400.0, -250.0, -300.0]), [*planes(12), *this_way_round()]
-    here = tracker.locate(NOTHING, 16, 0, evidence=told)
-    there = tracker.locate(NOTHING, 16, 0, None, shifted(told, away_mm), "tracker")
+    here = tracker.locate(NOTHING, grid=16, evidence=told)
+    there = tracker.locate(NOTHING, grid=16, evidence=shifted(told, away_mm), frame="tracker")
     for place in ("center_mm", "box_mm"):
         a, b = (np.array(getattr(f.report.parts["tumor_1"], place)) for f in (here, there))
         np.testing.assert_allclose(b - a, np.broadcast_to(away_mm, a.shape), atol=0.3)
@@ -440,21 +453,21 @@ def test_in_a_frame_of_its_own_evidence_has_its_answer_there(tracker, slim_model
     for a, b in zip(there.report.evidence, shifted(told, away_mm), strict=True):
         np.testing.assert_allclose(a.places_mm, b.places, atol=1e-6)
     with pytest.raises(InputError, match="camera"):
-        tracker.locate(SensorCloud(SEEN), 16, 0, None, told, "tracker")
+        tracker.locate(SensorCloud(SEEN), grid=16, evidence=told, frame="tracker")
     file, out = tmp_path / "e.json", tmp_path / "out"
     content = json.loads(evidence_json(tuple(shifted(told, away_mm))))
     file.write_text(json.dumps({**content, "frame": "tracker"}))
     options = "--grid", 32, "--device", "cpu", "--evidence", file
-    answered(tumortrack("locate", slim_model, "-", out, *options))
+    answered(tumortrack("locate", slim_model, "-", "--out", out, *options))
     for name in ("report.json", "manifest.json"):
         assert json.loads((out / name).read_text())["frame"] == "tracker"
 
 
 def test_one_wrong_plane_of_many_is_named_and_moves_nothing(tracker):
     told = [*planes(12), *this_way_round()]
-    right = tracker.locate(NOTHING, 16, 0, evidence=told)
+    right = tracker.locate(NOTHING, grid=16, evidence=told)
     told[4:5] = shifted(told[4:5], [0, 0, 22.0])
-    found = tracker.locate(NOTHING, 16, 0, evidence=told)
+    found = tracker.locate(NOTHING, grid=16, evidence=told)
     assert [n for n, each in enumerate(found.report.evidence) if each.left_out] == [4]
     assert found.report.evidence[4].off_mm > 10
     away_mm = found.motion.carry(VERTICES) - right.motion.carry(VERTICES)
@@ -463,7 +476,7 @@ def test_one_wrong_plane_of_many_is_named_and_moves_nothing(tracker):
 
 def test_what_is_as_likely_the_other_way_round_is_said_with_its_place(tracker):
     """Nothing tells which way round an ellipsoid lies."""
-    found = tracker.locate(NOTHING, 16, 0, evidence=planes(12))
+    found = tracker.locate(NOTHING, grid=16, evidence=planes(12))
     others, tumor = found.report.fit_cost.others, np.array(found.report.parts["tumor_1"].center_mm)
     places = [tumor, *(np.array(each.center_mm["tumor_1"]) for each in others)]
     assert min(np.linalg.norm(place - at_all(TUMOR).mean(0)) for place in places) < 3
@@ -475,7 +488,17 @@ def test_what_is_as_likely_the_other_way_round_is_said_with_its_place(tracker):
 def test_the_command_takes_a_file_and_says_what_is_wrong_with_it(slim_model, tmp_path):
     write_cloud_ply(tmp_path / "cloud.ply", SEEN.astype(np.float32))
     file, out = tmp_path / "e.json", tmp_path / "out"
-    command = "locate", slim_model, tmp_path / "cloud.ply", out, "--grid", 32, "--device", "cpu"
+    command = (
+        "locate",
+        slim_model,
+        tmp_path / "cloud.ply",
+        "--out",
+        out,
+        "--grid",
+        32,
+        "--device",
+        "cpu",
+    )
     content = json.loads(evidence_json((*touches(6), *this_way_round())))
     first = content["evidence"][0]
     wrong = {

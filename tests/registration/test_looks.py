@@ -83,7 +83,7 @@ def tracker(slim_model, monkeypatch):
 
 
 def located(tracker, first, *others):
-    return tracker.locate(first.cloud, 16, 0, first.seen, others)
+    return tracker.locate(first.cloud, views=others, seen=first.seen, grid=16)
 
 
 def off_mm(estimate, truth):
@@ -236,7 +236,7 @@ def test_the_command_takes_several_views(slim_model, tmp_path):
     left, right = (tmp_path / name for name in names)
     first, second = (["--intrinsics", path.with_suffix(".json")] for path in (left, right))
     poses, out = ["--poses", tmp_path / "poses.json"], tmp_path / "out"
-    given = [out, *first, "--range", 50, 400, "--device", "cpu", "--grid", 32]
+    given = ["--out", out, *first, "--range", 50, 400, "--device", "cpu", "--grid", 32]
     for views, options, named in (
         ([left, right], [], "--poses"),
         ([left], poses, "--poses"),
@@ -267,7 +267,7 @@ def test_an_organ_is_followed_by_several_cameras_and_by_one_that_goes_round(trac
         before = around((0, 0, 0, 50)[n])
         here = replace(views[0].cloud, stamp_ns=1 + n * second_ns // 10)
         way = np.linalg.inv(lead) @ before
-        estimate = follower.locate(here, views[0].seen, views[1:], way)
+        estimate = follower.locate(here, views[0].seen, views=views[1:], camera_from_last=way)
         found.append(transform_points(lead, estimate.motion.carry(INNER)))
         assert ("follow" in estimate.report.timings) == (n > 0)
         assert ("refine" in estimate.report.timings) == (n == 0)

@@ -11,6 +11,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+import tumortrack as tt
 from elastic_objects import CENTER, UP
 from stories import answered, tumortrack
 from tumortrack.core.errors import InputError, NoEstimate
@@ -97,6 +98,16 @@ def test_an_estimate_answers_in_arrays(tracker, stages, estimate):
         unmoved.forward(points_ct)
     with pytest.raises(InputError):
         tracker.locate([[0.0, 0.0, 100.0]])
+
+
+def test_one_call_locates_with_a_folder_or_a_model(slim_model, model, stages, estimate):
+    points_mm = np.array(stages[0].cloud.points_mm, np.float64)
+    for case, points in ((slim_model, points_mm), (str(slim_model), stages[0].cloud)):
+        found = tt.locate(case, points, grid=48, seed=3)
+        np.testing.assert_array_equal(found.cloud.points_mm, estimate.cloud.points_mm)
+    assert isinstance(tt.locate(model, points_mm, grid=16), tt.Estimate)
+    with pytest.raises(InputError):
+        tt.locate(model, points_mm / 1000)  # metres
 
 
 def test_the_same_cloud_and_seed_give_the_same_estimate(tracker, stages, estimate):
@@ -205,7 +216,17 @@ def test_the_command_says_where_points_of_the_ct_are(slim_model, stages, estimat
     lines = [f"p{n},{','.join(map(str, p))}" for n, p in enumerate(points)]
     (tmp_path / "asked.csv").write_text("\n".join(["name,x,y,z", *lines, ""]))
     out = tmp_path / "out"
-    command = ["locate", slim_model, tmp_path / "cloud.ply", out, "--grid", 48, "--seed", 3]
+    command = [
+        "locate",
+        slim_model,
+        tmp_path / "cloud.ply",
+        "--out",
+        out,
+        "--grid",
+        48,
+        "--seed",
+        3,
+    ]
     said = answered(tumortrack(*command, "--map", tmp_path / "asked.csv", "--device", "cpu"))
     assert "3 points of the CT" in said
     rows = list(csv.DictReader((out / "points.csv").open()))

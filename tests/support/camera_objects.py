@@ -70,7 +70,7 @@ class Located(Tracker):
     def __init__(self, *verdicts):  # no model
         self._verdicts, self.asked = list(verdicts), []
 
-    def follow(self, cloud, last=None, how=None, seen=None, evidence=()):
+    def follow(self, cloud, last=None, how=None, seen=None, *, views=(), evidence=()):
         self.asked.append((last, evidence))
         verdict = self._verdicts.pop(0) if self._verdicts else "good"
         if verdict == "none":

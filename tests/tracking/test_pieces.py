@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -46,15 +47,15 @@ def thinned(points):
 
 def test_the_organ_is_found_beside_what_looked_more_like_it(tracker, image):
     seen, organ, plate = image
-    alone = tracker.locate(organ, 16, 0, seen)
-    for locate in (tracker.locate, lambda cloud, *_: tracker.follow(cloud, seen=seen)):
-        found = locate(replace(plate, others=(organ,)), 16, 0, seen)
+    alone = tracker.locate(organ, grid=16, seen=seen)
+    for locate in (partial(tracker.locate, grid=16), tracker.follow):
+        found = locate(replace(plate, others=(organ,)), seen=seen)
         away_mm = np.abs(found.organ_mesh.box_mm - alone.organ_mesh.box_mm).max()
         assert away_mm < 0.5
         assert found.report.piece == 1
         assert found.report.timings["pieces"] > 0
     with pytest.raises(NotThisOrgan):
-        tracker.locate(plate, 16, 0, seen)
+        tracker.locate(plate, grid=16, seen=seen)
 
 
 def test_what_is_the_organ_is_tried_alone_and_what_is_not_to_the_end(tracker, image):
@@ -63,7 +64,7 @@ def test_what_is_the_organ_is_tried_alone_and_what_is_not_to_the_end(tracker, im
 
     def located(looks):
         tries.append(len(looks[0].cloud.points_mm))
-        return tracker.locate(replace(looks[0].cloud, others=()), 16, 0, seen)
+        return tracker.locate(replace(looks[0].cloud, others=()), grid=16, seen=seen)
 
     for first, others, count in ((organ, (plate,), 1), (plate, (plate, organ, plate), 4)):
         tries.clear()
@@ -91,7 +92,7 @@ def test_an_organ_behind_an_occluder_stays_one(tracker, along, width_px):
     depth = np.where(band, np.nanmin(clean.depth_mm) - 15, clean.depth_mm).astype(np.float32)
     view = View(Path("depth.png"), clean.with_depth(depth))
     found = view.organ(tracker.model, LocateOptions(), Hints())
-    estimate = tracker.locate(found.cloud, 16, 0, view.content)
+    estimate = tracker.locate(found.cloud, grid=16, seen=view.content)
     (fitted,) = as_fitted([view], [found], estimate, tracker.model)
     taken = fitted.taken == 0
     assert not taken[band].any()

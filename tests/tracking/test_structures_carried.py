@@ -35,7 +35,7 @@ def carried(slim_model):
     down[:3, 3] = [0, 0, 150]
     turned = transform_points(down, anatomy.organ.vertices_mm - anatomy.organ.box_mm.mean(0))
     cloud = SensorCloud(turned[turned[:, 2] < 150][::4])
-    estimate = Tracker(case_like).locate(cloud, 24)
+    estimate = Tracker(case_like).locate(cloud, grid=24)
     return sheet, estimate
 
 

@@ -1,8 +1,8 @@
 """A tracker as PlusServer is one: pyigtl's server, in a process of its own, for it takes signals.
 
-igtl_peer.py TOOL POSE      says its port; then `touch` (0.4 s of poses of two tools, of which ours,
-                            at the POSE, touches from 0.1 s on, beside an image) or `missing` on
-                            standard input, and an empty line when it is done
+igtl_peer.py TOOL POSE      says its port; then with each line of standard input 0.4 s of poses of
+                            two tools, of which ours, at the POSE, touches from 0.1 s on, beside an
+                            image; and an empty line when it is done
 """
 
 from __future__ import annotations
@@ -25,18 +25,12 @@ def tell(*messages: pyigtl.messages.MessageBase) -> None:
         server.send_message(message, wait=False)  # else each takes 10 ms
 
 
-for line in sys.stdin:
-    contact = pyigtl.StringMessage("0", device_name="contact")
-    if line.strip() == "missing":
-        lost = pyigtl.TransformMessage(pose, device_name=tool)
-        lost.metadata = {"TransformStatus": "MISSING"}
-        tell(contact, lost)
-    else:
-        for n in range(40):
-            contact = pyigtl.StringMessage("1" if n >= 10 else "0", device_name="contact")
-            other = pyigtl.TransformMessage(np.eye(4), device_name="Other")
-            tell(pyigtl.ImageMessage(image, device_name="Image_Reference"), other)
-            tell(pyigtl.TransformMessage(pose, device_name=tool), contact)
-            time.sleep(0.01)
+for _ in sys.stdin:
+    for n in range(40):
+        contact = pyigtl.StringMessage("1" if n >= 10 else "0", device_name="contact")
+        other = pyigtl.TransformMessage(np.eye(4), device_name="Other")
+        tell(pyigtl.ImageMessage(image, device_name="Image_Reference"), other)
+        tell(pyigtl.TransformMessage(pose, device_name=tool), contact)
+        time.sleep(0.01)
     print(flush=True)
 server.stop()

@@ -77,10 +77,9 @@ def send(kind: str, hz: float, seconds: float) -> None:
 
 
 def tool_pose(stamp_ns: int) -> np.ndarray:
-    """base_link from a tool that shifts and turns at a constant rate, m."""
-    seconds = (stamp_ns % 10**11) * 1e-9
-    turn = Rotation.from_rotvec([0, 0.3 * seconds, 0]).as_matrix()
-    return rigid(turn, np.array([0.02 * seconds, 0.5, 0.1]))
+    """base_link from a tool that turns at a constant rate, round in 20 s, m."""
+    turn = Rotation.from_rotvec([0, 2 * np.pi * (stamp_ns % (20 * 10**9)) / 20e9, 0])
+    return rigid(turn.as_matrix(), np.array([1.0, 0.5, 0.1]))
 
 
 def transforms(hz: float, seconds: float) -> None:

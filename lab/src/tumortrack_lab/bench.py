@@ -193,7 +193,7 @@ def _frames(subject: BenchSubject) -> Iterator[Workload]:
     tracker = Tracker(subject.model)
 
     def locate() -> float:
-        return tracker.locate(subject.cloud, _NO_VOLUME, 0).report.timings["volume"]
+        return tracker.locate(subject.cloud, grid=_NO_VOLUME).report.timings["volume"]
 
     note = "locate without its volume: labels, probabilities, surfaces, report"
     yield Workload("frame", METHOD, "frame", locate, lambda: note)
@@ -219,7 +219,7 @@ def _tracking(subject: BenchSubject) -> Iterator[Workload]:
 
 def _volumes(subject: BenchSubject) -> Iterator[Workload]:
     """From an estimate's surfaces to a label in every voxel."""
-    estimate = Tracker(subject.model).locate(subject.cloud, _NO_VOLUME, 0)
+    estimate = Tracker(subject.model).locate(subject.cloud, grid=_NO_VOLUME)
     anatomy = Anatomy(tuple(estimate.meshes.values()))
     grid = grid_over(anatomy.organ.vertices_mm, _GRID)
     fill = partial(label_grid, anatomy, *grid)
@@ -233,7 +233,16 @@ def _command(subject: BenchSubject) -> Iterator[Workload]:
     with tempfile.TemporaryDirectory() as folder:
         cloud, out = Path(folder) / "cloud.ply", Path(folder) / "out"
         write_cloud_ply(cloud, subject.cloud.points_mm)
-        words = "locate", subject.folder / METHOD, cloud, out, "--overwrite", "--device", "cpu"
+        words = (
+            "locate",
+            subject.folder / METHOD,
+            cloud,
+            "--out",
+            out,
+            "--overwrite",
+            "--device",
+            "cpu",
+        )
         for name, grid in {"locate command": 160, "locate --grid 400 command": _GRID}.items():
             peaks: list[int] = []
             call = partial(_kept_peak, peaks, *words, "--grid", grid)
@@ -256,7 +265,7 @@ def _patient(subject: BenchSubject) -> Iterator[Workload]:
 
         def call() -> None:
             case, out = (Path(folder) / f"{name}-{len(runs)}" for name in ("case", "out"))
-            steps = ("prepare", labels, case), ("locate", case, cloud, out)
+            steps = ("prepare", labels, "--out", case), ("locate", case, cloud, "--out", out)
             runs.append([run_command(*step)[0] for step in steps])
 
         def note() -> str:

@@ -138,7 +138,7 @@ class Locating:
         surfaces are not the case's."""
         row = Row(scene=str(folder.resolve()), sha256=store.sha256_of(folder))
         try:
-            found = self._tracker.locate(scene.cloud, _GRID, self._seed, scene.depth)
+            found = self._tracker.locate(scene.cloud, grid=_GRID, seed=self._seed, seen=scene.depth)
         except NoEstimate as error:
             return Row(row.scene, row.sha256, doubt=str(error))
         bounds = deciding(found.assessment.bounds)

@@ -42,7 +42,7 @@ def of_estimate(estimate: Estimate) -> Located:
     return Located(
         estimate.cloud.points_mm,
         estimate.cloud.labels,
-        estimate.meshes,
+        dict(estimate.meshes),
         _bounds_mm(estimate.assessment),
         stamp_ns=estimate.cloud.stamp_ns,
         patient=estimate.patient,

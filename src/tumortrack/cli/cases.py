@@ -12,6 +12,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 from tumortrack.case.options import ORGAN_HU, PrepareOptions
 from tumortrack.cli.console import (
     Device,
+    inputs_and_out,
     keep_loaded,
     model_folder,
     options_of,
@@ -23,6 +24,8 @@ from tumortrack.cli.console import (
 )
 from tumortrack.tracking.options import ExportOptions, SimulateOptions, check_grid
 
+_USAGE = "prepare INPUT [MORE ...] --out CASE"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Prepare(PrepareOptions):
@@ -30,10 +33,9 @@ class Prepare(PrepareOptions):
 
     Attributes:
         input: DICOM folder, CT volume, label map or segmentation (.nii, .nii.gz, .nrrd, .seg.nrrd,
-            DICOM), folder of meshes or of label files with one structure each; or such files one
-            after the other.
-        case: folder to write.
-        more: with several files: the paths that follow; the last one is CASE.
+            DICOM), folder of meshes or of label files with one structure each.
+        more: further files of meshes or labels.
+        out: folder to write: the case.
         segment: segment the CT by a tool of yours, with weights that you have:
             totalsegmentator, totalsegmentator:TASK (liver_lesions, ...: also tumors),
             nnunet:FOLDER or monai:BUNDLE. Its label map is kept beside CASE (docs/segment.md).
@@ -41,8 +43,8 @@ class Prepare(PrepareOptions):
     """
 
     input: Positional[Path]
-    case: Positional[Path]
     more: Positional[tuple[Path, ...]] = ()
+    out: Path | None = None
     organ_hu: Annotated[tuple[float, float], arg(aliases=["--kidney-hu"])] = ORGAN_HU
     side: Literal["left", "right"] | None = None
     unit: Literal["mm", "m"] | None = None
@@ -53,8 +55,7 @@ class Prepare(PrepareOptions):
     overwrite: bool = False
 
     def run(self) -> None:
-        paths = [self.input, self.case, *self.more]
-        inputs, folder = paths[:-1], paths[-1]
+        inputs, folder = inputs_and_out((self.input, *self.more), self.out, _USAGE)
         words = ", ".join(map(str, inputs))
         with progress_of("the case's model", f"reading {words}, making surfaces ...") as made:
             from tumortrack import api

@@ -7,7 +7,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from functools import partial
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
+from tumortrack.core.errors import InputError
 from tumortrack.tracking import options
 from tumortrack.tracking.options import Device as Device
 
@@ -104,6 +105,20 @@ def progress_of(what: str, first: str = "") -> Iterator[Callable[..., None]]:
 def model_folder(given: Path) -> Path:
     """``tracking.options.model_folder``, with a progress bar where a case's model is made."""
     return options.model_folder(given, partial(progress_of, "making the case's model, once"))
+
+
+def inputs_and_out(
+    paths: Sequence[Path], out: Path | None, usage: str
+) -> tuple[Sequence[Path], Path]:
+    """A command's inputs, and the folder to write. Without --out the last path is that folder, as
+    it was once: a note says how to write it now. Raises InputError: nothing is left as an input."""
+    if out is not None:
+        return paths, out
+    *inputs, last = paths
+    if not inputs:
+        raise InputError(f"say where to write. The order is: tumortrack {usage}")
+    print(f"note: {last} is taken for the folder to write: {usage}.", file=sys.stderr)
+    return inputs, last
 
 
 def options_of(command: object, kind: type[Any]) -> dict[str, Any]:

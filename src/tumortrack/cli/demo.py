@@ -61,7 +61,7 @@ class Demo:
         api.scan_phantom(out / "ct_dicom", spacing_mm=datasets.SPACING_MM)
         say("2/3 segmenting the CT, making surfaces and an elastic body")
         began = time.perf_counter()
-        Prepare(input=out / "ct_dicom", case=out / "case").run()
+        Prepare(input=out / "ct_dicom", out=out / "case").run()
         made_s = time.perf_counter() - began
         say("3/3 locating kidney and tumors, each time from one depth image, after other physics")
         for name, scene in datasets.phantom_scenes(self.scenes).items():

@@ -10,6 +10,7 @@ from tyro.conf import Positional, UseAppendAction
 
 from tumortrack.cli.console import (
     console,
+    inputs_and_out,
     keep_loaded,
     model_folder,
     options_of,
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from tumortrack.report.locating import Located
 
 
+_USAGE = "locate CASE CLOUD [MORE ...] --out OUT"
 _MOST_SAID = 12  # pieces of evidence that agree: of more, their number alone
 
 
@@ -40,19 +42,18 @@ class Locate(LocateOptions):
     Attributes:
         model: a case, or a folder that `train` wrote.
         cloud: .ply, .pcd or .npz in the camera frame, or a depth image (with --intrinsics): 16-bit
-            PNG or TIFF, or a TIFF of floats; or -: none, but touches (--evidence). Several views
-            of an organ that does not move in between (CLOUD CLOUD ... OUT) need --poses; the answer
-            is in the first one's frame.
+            PNG or TIFF, or a TIFF of floats; or -: none, but touches (--evidence).
+        more: further views of an organ that does not move in between; they need --poses, and the
+            answer is in the first one's frame.
         out: folder to write.
-        more: with several views: the paths that follow; the last one is OUT.
         json: print the report (OUT/report.json); sentences go to standard error.
         overwrite: replace OUT if it exists.
     """
 
     model: Positional[Path]
     cloud: Positional[Path]
-    out: Positional[Path]
     more: Positional[tuple[Path, ...]] = ()
+    out: Path | None = None
     intrinsics: UseAppendAction[tuple[Path, ...]] = ()
     json: bool = False
     overwrite: bool = False
@@ -65,17 +66,16 @@ class Locate(LocateOptions):
 
         check_grid(self.grid)
         console.stderr = self.json
-        paths = [self.cloud, self.out, *self.more]
-        clouds, out = paths[:-1], paths[-1]
+        clouds, out = inputs_and_out((self.cloud, *self.more), self.out, _USAGE)
         if self.model.is_file() and (self.cloud / store.MANIFEST).is_file():
             raise InputError(
                 f"{self.model} stands where the model belongs, and {self.cloud} where the cloud. "
-                f"The order is: tumortrack locate {self.cloud} {self.model} {self.out}"
+                f"The order is: tumortrack locate {self.cloud} {self.model} --out {out}"
             )
         overwrite = self.overwrite or has_no_estimate(out)
         store.check_place(out, "run", overwrite)
         model_folder(self.model)
-        located = api.locate(self.model, clouds, **options_of(self, LocateOptions))
+        located = api.locate_files(self.model, clouds, **options_of(self, LocateOptions))
         if located.estimate is not None:
             _say_estimate(located.estimate, located)
         located.save(out, overwrite)  # slow imports come after the verdict

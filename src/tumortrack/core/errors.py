@@ -26,6 +26,12 @@ class InputError(TumortrackError):
     exit_code = 2
 
 
+class UnknownPart(InputError, KeyError):
+    """A name that no part of an estimate has."""
+
+    __str__ = Exception.__str__  # KeyError's shows the message in quotes
+
+
 @contextmanager
 def readable(file: object, fault: str = "cannot be read") -> Iterator[None]:
     """Libraries raise anything on a damaged ``file``: in this context it becomes an InputError."""

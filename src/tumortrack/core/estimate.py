@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from importlib import import_module
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import msgspec
@@ -12,16 +14,17 @@ from jaxtyping import Float, Float64
 
 from tumortrack.core.assessment import Assessment, Quality
 from tumortrack.core.config import Config, check_seed
-from tumortrack.core.errors import InputError
-from tumortrack.core.evidence import Evidence
+from tumortrack.core.errors import InputError, UnknownPart
+from tumortrack.core.evidence import CAMERA, Evidence
 from tumortrack.core.geometry import Points
 from tumortrack.core.organ import KIDNEY, Organ, is_tumor
 from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.report import Finding, FitReport, Likely
 from tumortrack.core.rigid_fit import kabsch
-from tumortrack.core.types import CameraLabels, Mesh, OccupancyCloud
+from tumortrack.core.types import CameraLabels, DepthFrame, Mesh, OccupancyCloud, SensorCloud
 
 LARGEST_GRID = 400
+_MOST_NAMED = 7  # parts in an estimate's repr
 FAR_MM = 5.0  # an answer with a tumor's centre farther off has failed: a plan's whole usual margin
 # Shown beside "good", which alone would claim more than is known.
 NO_CHECK_FAILED, UNVERIFIED = "no check failed", "its place is not verified"
@@ -70,6 +73,14 @@ class LocatedPart:
     error_bound95_mm: float | None
 
 
+class Parts(dict[str, LocatedPart]):
+    """What was found, by name; another name raises ``UnknownPart``, a KeyError that names those
+    that there are."""
+
+    def __missing__(self, name: str) -> LocatedPart:
+        raise UnknownPart(f"{name!r} was not found; there are: {', '.join(self) or 'none'}.")
+
+
 class FollowOptions(Config, frozen=True, kw_only=True):
     """How to locate a frame of a sequence. ``thorough``: also search independently of the last
     estimate and keep the better fit, as a search near the last one would keep its error.
@@ -108,11 +119,12 @@ class Estimate:
         patient: of the model; nothing verifies that this is what the camera sees.
         structures: other surfaces of the CT that move with it, by name; empty without a motion.
         evidence: what is known beside the cloud, for the next frame.
+        frame: the camera's, or that of evidence alone, without a cloud.
     """
 
     cloud: OccupancyCloud
     volume: CameraLabels | None
-    meshes: dict[str, Mesh]
+    meshes: Mapping[str, Mesh]
     report: FitReport
     motion: Motion | None = None
     unsmoothed: Motion | None = None
@@ -121,17 +133,50 @@ class Estimate:
     organ: Organ = KIDNEY
     structures: Mapping[str, Mesh] = field(default_factory=dict)
     evidence: tuple[Any, ...] = ()
+    frame: str = CAMERA
 
     def __repr__(self) -> str:
-        """The verdict, and where each part is, in about ten lines."""
-        lines = [verdict_words(self.quality, self.reason)]
-        for name, part in self.report.parts.items():
+        """The verdict, where the organ and each tumor are, and the frame, in ten lines at most."""
+        lines = [f"Estimate: {verdict_words(self.quality, self.reason)}"]
+        parts = self.report.parts
+        for name, part in list(parts.items())[:_MOST_NAMED]:
             middle = None if part.center_mm is None else [round(n, 1) for n in part.center_mm]
             bound = self.assessment.bound_words(name)
             where = f"center_mm={middle}{bound and f', {bound}'}" if part.found else "not found"
             lines.append(f"{name}: {where}")
-        frame = f"{len(self.cloud.points_mm)} points; camera frame: x right, y down, z forward, mm"
-        return "\n".join([f"Estimate: {lines[0]}", *lines[1:], frame])
+        if len(parts) > _MOST_NAMED:
+            lines.append(f"and {len(parts) - _MOST_NAMED} other parts")
+        axes = ": x right, y down, z forward" if self.frame == CAMERA else ""
+        return "\n".join([*lines, f"frame: {self.frame}{axes}; mm"])
+
+    def save(
+        self,
+        folder: str | Path,
+        overwrite: bool = False,
+        *,
+        cloud: SensorCloud | None = None,
+        seen: DepthFrame | SensorCloud | None = None,
+    ) -> None:
+        """Write what `tumortrack locate` writes: points, labelled volume, surfaces, report, and a
+        page to look at (index.html, picture.png). Raises InputError: the folder exists and
+        ``overwrite`` is False, or the estimate is of a live frame and has no volume; StorageError:
+        the disk refused.
+
+        Args:
+            cloud: the organ's points, in which it was located, for the page.
+            seen: all that the camera saw, likewise.
+        """
+        _located(self, cloud, seen).save(folder, overwrite)
+
+    def show(
+        self,
+        *,
+        cloud: SensorCloud | None = None,
+        seen: DepthFrame | SensorCloud | None = None,
+    ) -> None:
+        """Show that page: within a notebook, else in the browser. Where there is no display, print
+        where the page is: in a folder for temporary files. Arguments as of ``save``."""
+        _located(self, cloud, seen).show()
 
     @property
     def finding(self) -> Finding | None:
@@ -150,25 +195,29 @@ class Estimate:
         return self.assessment.reason
 
     @property
-    def parts(self) -> dict[str, LocatedPart]:
-        """What was found, by name: the organ, then its tumors."""
+    def parts(self) -> Mapping[str, LocatedPart]:
+        """What was found, by name: the organ, then its tumors. Another name raises UnknownPart, an
+        InputError and KeyError."""
         shown = self.assessment.shown
-        return {
-            name: LocatedPart(
+        return Parts(
+            (
                 name,
-                np.array(part.center_mm, np.float64),
-                self.meshes[name].volume_ml,
-                self.meshes[name],
-                shown[name].error_bound95_mm if name in shown else None,
+                LocatedPart(
+                    name,
+                    np.array(part.center_mm, np.float64),
+                    self.meshes[name].volume_ml,
+                    self.meshes[name],
+                    shown[name].error_bound95_mm if name in shown else None,
+                ),
             )
             for name, part in self.report.parts.items()
             if part.center_mm is not None and name in self.meshes
-        }
+        )
 
     @property
-    def tumors(self) -> dict[str, LocatedPart]:
-        """The tumors that were found, by name: tumor_1, ..."""
-        return {name: part for name, part in self.parts.items() if is_tumor(name)}
+    def tumors(self) -> Mapping[str, LocatedPart]:
+        """The tumors that were found, by name: tumor_1, ...; other names as of ``parts``."""
+        return Parts((name, part) for name, part in self.parts.items() if is_tumor(name))
 
     @property
     def camera_from_ct(self) -> Float64[np.ndarray, "4 4"]:
@@ -208,3 +257,12 @@ class Estimate:
     def reporting(self, **changes: Any) -> Estimate:
         """The same estimate with these fields of its report replaced."""
         return replace(self, report=msgspec.structs.replace(self.report, **changes))
+
+
+def _located(
+    estimate: Estimate, cloud: SensorCloud | None, seen: DepthFrame | SensorCloud | None
+) -> Any:
+    """As `locate` writes and shows it. Files and pages lie in packages above this one, so they are
+    loaded by name, when a user asks for them."""
+    located = import_module("tumortrack.report.locating")
+    return located.Located(estimate, seen=located.Seen(cloud, seen))

@@ -82,9 +82,9 @@ def write_estimate(
         _seal(new, {**report_entry(estimate), **about}, estimate.quality)
 
 
-def report_head(stamp_ns: int) -> dict[str, Any]:
+def report_head(stamp_ns: int, frame: str = CAMERA) -> dict[str, Any]:
     """The first entries of every report."""
-    about = {"tumortrack": tumortrack.__version__, "units": "mm", "frame": CAMERA}
+    about = {"tumortrack": tumortrack.__version__, "units": "mm", "frame": frame}
     return {**about, "stamp_ns": stamp_ns}
 
 
@@ -93,7 +93,7 @@ def report_entry(estimate: Estimate) -> dict[str, Any]:
     check = "" if estimate.finding is None else estimate.finding.check
     quality = {"verdict": estimate.quality, "reason": estimate.reason, "check": check}
     return {
-        **report_head(estimate.cloud.stamp_ns),
+        **report_head(estimate.cloud.stamp_ns, estimate.frame),
         **{"seed": estimate.report.seed, "points": estimate.report.points},  # even if they are 0
         **msgspec.to_builtins(estimate.report),
         "quality": quality,
@@ -165,6 +165,7 @@ def read_estimate(folder: Path) -> Estimate:
             patient=patient_in(stored.get("patient"), str(folder)),
             organ=organ_in(stored.get("organ"), str(folder)),
             structures={name: meshes[name] for name in report.structures},
+            frame=stored["frame"],
         )
     except (KeyError, TypeError, ValueError, OSError, InputError) as error:
         raise ArtifactError(f"{folder} is no whole run: {error}. Locate again.") from error

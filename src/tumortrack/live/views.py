@@ -182,8 +182,13 @@ class ViewsLocator:
             return estimate
         way = self._camera_from_last(lead)
         self.evidence = (*evidence, *self.tools.evidence(lead))
-        known = *_further_looks(lead, more), *self.evidence
-        estimate = self._follower.locate(organ, lead.seen.content, known, way)
+        estimate = self._follower.locate(
+            organ,
+            lead.seen.content,
+            views=_further_looks(lead, more),
+            evidence=self.evidence,
+            camera_from_last=way,
+        )
         self.tools.located(lead, estimate)
         self._published_from_last = lead.published_from_camera
         self._follow_pick(lead, organ)
@@ -279,7 +284,7 @@ class Scan:
         looks = _further_looks(last, others)
         try:
             estimates = [
-                self._tracker.follow(cloud, seen=last.seen.content, evidence=looks[:n])
+                self._tracker.follow(cloud, seen=last.seen.content, views=looks[:n])
                 for n in range(SCAN_LOOKS)
             ]
         except NoEstimate as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -15,7 +16,7 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.evidence import CAMERA, Evidence
 from tumortrack.io.evidence_files import read_evidence
 from tumortrack.io.points import PointTable, check_near_organ, read_points
-from tumortrack.report.seen import Seen
+from tumortrack.report.seen import PAGE, Seen
 from tumortrack.tracking.options import LocateOptions, check_grid, model_folder
 from tumortrack.tracking.views import (
     NO_CLOUD,
@@ -65,6 +66,16 @@ class Located:
         head = {} if self.estimate is None else report_entry(self.estimate)
         return {**head, **self.about}
 
+    def show(self) -> None:
+        """Show the page: within a notebook, else in the browser; without a display, print where it
+        is. Raises StorageError: the disk refused."""
+        from tumortrack.report.page import write_run_page
+        from tumortrack.report.showing import show
+
+        folder = Path(tempfile.mkdtemp(prefix="tumortrack-"))
+        write_run_page(folder, self.report, self.estimate, self.seen)
+        show(folder / PAGE)
+
     def save(self, folder: str | Path, overwrite: bool = False) -> None:
         """Write the folder that `tumortrack locate` writes. Raises InputError: it exists and
         ``overwrite`` is False; StorageError: the disk refused."""
@@ -80,7 +91,7 @@ class Located:
 
 
 def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Located:
-    """Locate in views of an organ at rest, with a model or case; see ``api.locate``."""
+    """Locate in views of an organ at rest, with a model or case; see ``api.locate_files``."""
     check_grid(options.grid)
     folder = model_folder(given)
     points = _points(given, folder, options)
@@ -112,8 +123,15 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
         found.extend(view.organ(model, options, hints) for view in views)
         organs = [organ.cloud for organ in found]
         looks = further_looks(organs, views, fixed_from_camera)
-        known = views[0].content, (*looks, *evidence), frame
-        estimate = tracker.locate(organs[0], options.grid, options.seed, *known)
+        estimate = tracker.locate(
+            organs[0],
+            views=looks,
+            evidence=evidence,
+            seen=views[0].content,
+            grid=options.grid,
+            seed=options.seed,
+            frame=frame,
+        )
     except NoEstimate as error:
         about["input"] = [organ.entry for organ in found]
         about = {**_no_estimate(error, views[0], model, options), **about}
@@ -142,7 +160,6 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
             "clouds_sha256": [store.sha256_of(path) for path in clouds],
         }
     if frame != CAMERA:
-        about["frame"] = frame
         about["notes"].append(f"all places are in the frame {frame!r}: the organ may lie any way.")
     if options.evidence is not None:
         about["evidence_sha256"] = store.sha256_of(options.evidence)

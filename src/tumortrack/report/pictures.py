@@ -282,7 +282,7 @@ def run_panels(estimate: Estimate | None, seen: Seen) -> tuple[list[Panel], list
 
 
 def _slice(estimate: Estimate, seen: Seen, part: str, way: str) -> Image.Image:
-    plane = plane_through(dict(estimate.meshes), part, way)
+    plane = plane_through(estimate.meshes, part, way)
     assert plane is not None  # an estimate with that part, and its organ
     ground = None
     if seen.ct is not None and estimate.motion is not None:

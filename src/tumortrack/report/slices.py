@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -124,7 +124,7 @@ def _sample(
     return map_coordinates(values, index, output=np.float32, order=order, cval=np.nan)
 
 
-def plane_through(meshes: dict[str, Mesh], part: str, orientation: str) -> SlicePlane | None:
+def plane_through(meshes: Mapping[str, Mesh], part: str, orientation: str) -> SlicePlane | None:
     """Through the centre of a part's present surface; centred on the organ, and as large."""
     if part not in meshes or (organ := organ_name(meshes)) is None:
         return None

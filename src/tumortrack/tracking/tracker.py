@@ -80,43 +80,42 @@ class Tracker:
 
     def locate(
         self,
-        cloud: SensorCloud | Float[np.ndarray, "n 3"],
+        points: SensorCloud | Float[np.ndarray, "n 3"],
+        *,
+        views: Sequence[Look] = (),
+        evidence: Sequence[Evidence] = (),
+        seen: DepthFrame | SensorCloud | None = None,
         grid: int = 160,
         seed: int = 0,
-        seen: DepthFrame | SensorCloud | None = None,
-        evidence: Sequence[Evidence | Look] | Evidence | Look = (),
         frame: str = CAMERA,
     ) -> Estimate:
         """The full estimate from one cloud; the same cloud and seed give the same result.
 
         Args:
-            cloud: observed points, camera frame, mm; an array will do.
-            grid: voxels along the longest side of the dense volume.
-            seen: all that the camera saw, by which the estimate is judged; default: the cloud.
-            evidence: what else is known of where it lies then: each ``Look`` from another place,
-                ``Touch``, ``Landmark``, ``Held``, ``Outline``, ``Free``, in the frame of ``cloud``,
-                which may be empty: then of twelve places or more, touched or outlined.
-            frame: without a cloud: of the evidence, and of the answer; in another one than a
+            points: of the organ, as the camera sees them: n x 3, camera frame, mm.
+            views: of further cameras, or from other places, while the organ rests.
+            evidence: what else is known of where it lies then: ``Touch``, ``Landmark``, ``Held``,
+                ``Outline``, ``Free``, in the frame of ``points``. There may be no points: then it
+                has twelve places or more, touched or outlined.
+            seen: all that the camera saw, by which the estimate is judged; default: ``points``.
+            grid: voxels along the longest side of the labelled volume.
+            seed: of the random points.
+            frame: without points: of the evidence, and of the answer; in another one than a
                 camera's the organ may lie any way.
 
         Raises:
             NoEstimate: too few points, no organ found in them, not the organ of this model, or the
                 camera sees through the place where it would be.
-            InputError: the cloud is in metres; the seed is not allowed; evidence of a part that
-                the organ lacks; more than one look, or evidence, with a model that knows no motion.
+            InputError: points that are not n x 3, not finite, or in metres; a seed that is not
+                allowed; evidence of a part that the organ lacks; a view among the evidence; views
+                or evidence with a model that knows no motion.
         """
         check_seed(seed)
-        if isinstance(cloud, np.ndarray):
-            cloud = SensorCloud(cloud)
-        if not isinstance(cloud, SensorCloud):
-            raise InputError(
-                f"locate takes points, n x 3 in mm in the camera frame, or a SensorCloud, not "
-                f"{type(cloud).__name__}: numpy.asarray(POINTS), or read_cloud(FILE)."
-            )
+        cloud = cloud_of(points)
         looks: Sequence[Look]
-        looks, pieces = _parted(cloud, seen, evidence)
+        looks, pieces = _looks_of(cloud, seen, views), _evidence_of(evidence)
         if frame != CAMERA:
-            return self._located_in_frame(cloud, pieces, grid, seed)
+            return replace(self._located_in_frame(cloud, pieces, grid, seed), frame=frame)
         return self._located(cloud, looks, pieces, grid, seed)
 
     def _located_in_frame(
@@ -160,15 +159,18 @@ class Tracker:
         last: Estimate | None = None,
         how: FollowOptions = _DEFAULTS,
         seen: DepthFrame | SensorCloud | None = None,
-        evidence: Sequence[Evidence | Look] = (),
+        *,
+        views: Sequence[Look] = (),
+        evidence: Sequence[Evidence] = (),
     ) -> Estimate:
         """A fast estimate for one frame of many: without a volume, from a search that starts at the
-        ``last`` estimate, if there is a recent one. ``evidence``: what is new with this frame.
-        Models that know no motion cannot smooth. Raises as ``locate``."""
+        ``last`` estimate, if there is a recent one. ``views``: of further cameras; ``evidence``:
+        what is new with this frame. Models that know no motion cannot smooth. Raises as ``locate``.
+        """
         # A fit that is suddenly worse may be to another object.
         strictly = how.either_side if last is None else last.quality != "good" or not _unusual(last)
         looks: Sequence[Look]
-        looks, pieces = _parted(cloud, seen, evidence)
+        looks, pieces = _looks_of(cloud, seen, views), _evidence_of(evidence)
         if pieces:
             how = msgspec.structs.replace(how, evidence=(*how.evidence, *pieces))
 
@@ -258,22 +260,45 @@ def _with_pieces(
     return estimate.reporting(evidence=tuple(next(mine if was else rest) for was in order))
 
 
-def _parted(
-    cloud: SensorCloud,
-    seen: DepthFrame | SensorCloud | None,
-    evidence: Sequence[Evidence | Look] | Evidence | Look,
-) -> tuple[tuple[Look, ...], tuple[Evidence, ...]]:
-    """All looks, the cloud's first, and the other evidence."""
-    several = isinstance(evidence, Iterable) and not isinstance(evidence, Mapping | str)
-    given: tuple[Any, ...] = tuple(evidence) if several else (evidence,)  # type: ignore[arg-type]
-    if wrong := [each for each in given if not isinstance(each, Evidence | Look)]:
+def cloud_of(points: SensorCloud | Float[np.ndarray, "n 3"]) -> SensorCloud:
+    """Raises InputError: they are no cloud, not n x 3, or not finite."""
+    if isinstance(points, SensorCloud):
+        return points
+    if not isinstance(points, np.ndarray):
         raise InputError(
-            "evidence is of Look, Touch, Landmark, Held, Outline and Free, not "
-            f"{type(wrong[0]).__name__}: evidence=[Touch(place_mm=(x, y, z))]."
+            "points are n x 3 in mm in the camera frame, or a SensorCloud, not "
+            f"{type(points).__name__}: numpy.asarray(POINTS), read_cloud(FILE), or locate_files."
         )
-    looks = Look(cloud, seen or cloud, HERE), *(each for each in given if isinstance(each, Look))
-    pieces = tuple(each for each in given if not isinstance(each, Look))
-    return tuple(map(_cleaned, looks)), pieces
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
+        raise InputError(
+            f"points are numbers, n x 3, in mm in the camera frame, not {points.dtype} of shape "
+            f"{points.shape}."
+        )
+    return SensorCloud(points)
+
+
+def _looks_of(
+    cloud: SensorCloud, seen: DepthFrame | SensorCloud | None, views: Sequence[Look]
+) -> tuple[Look, ...]:
+    """The cloud's view, then the others."""
+    hint = "views=[Look(cloud, seen, camera_from_look)]; touches and the like are evidence=[...]"
+    others = _all_of(Look, views, "views are of Look", hint)
+    return tuple(map(_cleaned, (Look(cloud, seen or cloud, HERE), *others)))
+
+
+def _evidence_of(evidence: Sequence[Evidence]) -> tuple[Evidence, ...]:
+    kinds = "evidence is of Touch, Landmark, Held, Outline and Free"
+    hint = "evidence=[Touch(place_mm=(x, y, z))]; further cameras' views are views=[...]"
+    return _all_of(Evidence, evidence, kinds, hint)
+
+
+def _all_of(kind: Any, given: Any, what: str, hint: str) -> tuple[Any, ...]:
+    """Raises InputError: something else is among what was given."""
+    several = isinstance(given, Iterable) and not isinstance(given, Mapping | str)
+    values = tuple(given) if several else (given,)
+    if wrong := [each for each in values if not isinstance(each, kind)]:
+        raise InputError(f"{what}, not {type(wrong[0]).__name__}: {hint}.")
+    return values
 
 
 def _cleaned(look: Look) -> Look:
@@ -361,12 +386,15 @@ class Follower:
         self,
         cloud: SensorCloud,
         seen: DepthFrame | SensorCloud | None = None,
-        evidence: Sequence[Evidence | Look] = (),
+        *,
+        views: Sequence[Look] = (),
+        evidence: Sequence[Evidence] = (),
         camera_from_last: Affine = HERE,
     ) -> Estimate:
-        """The estimate of this frame. ``evidence``: what became known with it, beside what was
-        known before; ``camera_from_last``: as in ``last_box_mm``. Raises NoEstimate, as
-        ``Tracker.follow``; the last estimate is then dropped, but not the evidence."""
+        """The estimate of this frame. ``views``: of further cameras; ``evidence``: what became
+        known with it, beside what was known before; ``camera_from_last``: as in ``last_box_mm``.
+        Raises NoEstimate, as ``Tracker.follow``; the last estimate is then dropped, but not the
+        evidence."""
         last, self._last, self._at_rest = self._recent(cloud.stamp_ns), None, False
         if last is not None and camera_from_last is not HERE:
             last = _seen_from(last, camera_from_last)
@@ -386,7 +414,9 @@ class Follower:
             earlier=earlier,
         )
         try:
-            self._last = self._tracker.follow(cloud, last, how, seen, evidence)
+            self._last = self._tracker.follow(
+                cloud, last, how, seen, views=views, evidence=evidence
+            )
         except NoEstimate as error:
             if error.causes:
                 self._causes = {**self._causes, "none": error.causes}
