@@ -35,7 +35,8 @@ from tumortrack.simulation.dataset import scene_maker
 from tumortrack.simulation.deform.elastic import ElasticConfig
 from tumortrack.simulation.phantom.digital import PhantomParameters, phantom_labels
 from tumortrack.simulation.scene import SceneConfig
-from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
+from tumortrack.tracking.follower import Follower, FollowerConfig
+from tumortrack.tracking.tracker import Tracker
 
 Numbers = dict[str, Any]
 Answer = tuple[str, Callable[[], Numbers]]

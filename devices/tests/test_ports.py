@@ -25,13 +25,14 @@ from tumortrack_devices.network import Pace, is_loopback
 from tumortrack_devices.sinks.openigtlink import OpenIgtLinkSinkConfig
 from tumortrack_devices.sinks.viewer import ViewerSink, ViewerSinkConfig
 from viewer_page import connected, page
+from workcell_objects import Arms
 
 _ALLOWED_MB = 200  # of growth
 
 
 @pytest.fixture
 def viewer() -> Iterator[ViewerSink]:
-    sink = ViewerSinkConfig(port=0).open(replace(small_setting(), arms=True))
+    sink = ViewerSinkConfig(port=0).open(replace(small_setting(), controller=Arms()))
     yield sink
     sink.close()
 

@@ -226,7 +226,7 @@ def test_the_view_for_rviz_shows_what_is_published(
     name: str, frame: str, topics: list[str], messages: Messages
 ) -> None:
     """Topics, frame and reliability of the views are the sink's."""
-    folder = HERE.parents[2] / "integrations" / "ros2" / "tumortrack_ros" / "rviz"
+    folder = HERE.parents[1] / "integrations" / "ros2" / "tumortrack_ros" / "rviz"
     view = (folder / name).read_text(encoding="utf-8")
     out = ResultMessages(messages, with_arms()).of(empty_update())
     sent = {one.topic("/tumortrack") for one in out}

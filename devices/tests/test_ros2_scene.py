@@ -43,7 +43,7 @@ from tumortrack_devices.sinks.ros import ACKNOWLEDGE
 MESSAGES = Messages()
 QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 PLACED = PublishedFrame("table", rigid(QUARTER, np.array([10.0, 20, 30])), calibrated=True)
-PACKAGE = Path(__file__).parents[2] / "integrations" / "ros2" / "tumortrack_ros"
+PACKAGE = Path(__file__).parents[1] / "integrations" / "ros2" / "tumortrack_ros"
 
 
 def sent(results: ResultMessages, update: TrackingResult) -> dict:

@@ -27,7 +27,7 @@ from reports import bounded
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
 from tumortrack.core.types import SensorCloud
-from tumortrack.live.values import Observation, PublishedFrame, Workcell
+from tumortrack.live.values import ControlState, Observation, PublishedFrame
 from tumortrack_devices.ros.messages import Messages, stamp_of
 from tumortrack_devices.ros.results import ResultMessages
 from tumortrack_devices.ros.sensors import (
@@ -45,7 +45,7 @@ from workcell_objects import virtual, with_arms, working
 HUMBLE, NOETIC = Messages("humble"), Messages("noetic")
 POINTS_M = np.array([[0.01, -0.02, 0.125], [0.003, 0.004, 0.13], [-0.05, 0.0, 0.2]])
 _TURN = Rotation.from_euler("xyz", [0.3, -1, 2]).as_matrix()
-BARE = Workcell("hold")  # nothing to show but its state
+BARE = ControlState("hold")  # nothing to show but its state
 TURNED = PublishedFrame("table", rigid(_TURN, np.array([50.0, -20, 9])))
 
 
@@ -393,7 +393,7 @@ def test_stamps_that_ros_cannot_say_are_refused(stamp_ns):
 
 @pytest.mark.parametrize(
     "update",
-    [small_update(), empty_update(), working(), virtual(), replace(working(), workcell=BARE)],
+    [small_update(), empty_update(), working(), virtual(), replace(working(), control=BARE)],
 )
 def test_bytes_are_those_of_plain_messages(update):
     """Blocks of points are written as the library writes lists of points."""

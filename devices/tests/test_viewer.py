@@ -365,13 +365,13 @@ def test_arms_move_without_being_sent_again_and_what_is_gone_is_removed(sinks, c
     assert nodes("/workcell").visible
     forearm, cut = nodes("/workcell/shape/cutter:forearm"), nodes("/workcell/line/cut:1")
     assert len(cut.points) == 40
-    now = working(1, 0.02).workcell
+    now = working(1, 0.02).control
     assert now is not None
     moved = next(shape for shape in now.shapes if shape.name == "cutter/forearm")
     forearm_before = forearm.position.copy()
     mesh_before = next(s for s in workcell().shapes if s.name == "cutter/forearm").mesh
     clock.sleep(0.1)
-    sink.publish(replace(working(1), workcell=now))
+    sink.publish(replace(working(1), control=now))
     assert (nodes("/workcell/shape/cutter:forearm") is forearm) == (moved.mesh is mesh_before)
     shown = nodes("/workcell/shape/cutter:forearm")
     assert shown.position == pytest.approx(moved.published_from_shape[:3, 3])
@@ -381,7 +381,7 @@ def test_arms_move_without_being_sent_again_and_what_is_gone_is_removed(sinks, c
     table = nodes("/workcell/shape/table")
     kept = tuple(shape for shape in now.shapes if shape.name != "holder/tip")
     clock.sleep(0.1)
-    sink.publish(replace(working(2), workcell=replace(now, shapes=kept, lines=now.lines[1:])))
+    sink.publish(replace(working(2), control=replace(now, shapes=kept, lines=now.lines[1:])))
     assert nodes("/workcell/shape/holder:tip") is None
     assert nodes("/workcell/line/cut:1") is None
     assert nodes("/workcell/line/cut:2") is not None
@@ -389,7 +389,7 @@ def test_arms_move_without_being_sent_again_and_what_is_gone_is_removed(sinks, c
     tip = nodes("/workcell/shape/cutter:tip")
     shapes = tuple(replace(s, colour=ENERGISED) if s.name == "cutter/tip" else s for s in kept)
     clock.sleep(0.1)
-    sink.publish(replace(working(3), workcell=replace(now, shapes=shapes)))
+    sink.publish(replace(working(3), control=replace(now, shapes=shapes)))
     assert nodes("/workcell/shape/cutter:tip") is tip  # its surface is not sent again
     assert tuple(tip.color) == ENERGISED
 
@@ -411,7 +411,7 @@ def test_arms_are_shown_without_an_estimate_and_never_after_silence(sinks, clock
     nowhere = replace(workcell().shapes[0], published_from_shape=np.zeros((4, 4)))
     broken = replace(workcell(), shapes=(nowhere,))
     with pytest.raises(ValueError, match="determinant"):
-        sink.publish(replace(working(3), workcell=broken))
+        sink.publish(replace(working(3), control=broken))
     assert not nodes("/workcell").visible
     assert drawn(sink, "kidney")
     clock.sleep(0.1)
@@ -455,10 +455,7 @@ def test_status_says_why_and_no_old_numbers():
     assert "0.75" not in good  # a probability of points, which reads as certainty
     doubtful = StatusPanel("poor", replace(sure, quality="poor"), 0.1, 8, parts=PARTS).numbers()
     assert "tumor 1</td><td>0.9 ml</td><td>–</td>" in doubtful
-    cell = replace(workcell(), left_mm=1.23)
-    arms = StatusPanel("good", replace(small_update(), workcell=cell), 0.1, 9, arms=True)
-    assert f">{cell.left}<" in arms.flag()
-    assert "1.2 mm" in cell.left
-    assert "2.3 mm" in replace(cell, left_mm=-2.34).left
-    assert replace(cell, left_mm=None).left == ""
+    moving = replace(workcell(), note="1.2 mm are left")
+    arms = StatusPanel("good", replace(small_update(), control=moving), 0.1, 9, arms=True)
+    assert ">1.2 mm are left<" in arms.flag()
     assert " ml" not in stale._replace(parts=PARTS).numbers()

@@ -26,7 +26,7 @@ from stories import COMMAND, environment, live_resection
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.live.values import PublishedFrame, SinkContext, TrackingResult
 from tumortrack_devices.sinks.viewer import ViewerSink, ViewerSinkConfig
-from workcell_objects import virtual, workcell
+from workcell_objects import Arms, virtual, workcell
 
 TURN = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
 ROBOT = PublishedFrame("robot", rigid(TURN, np.array([400.0, -250.0, 90.0])))
@@ -78,7 +78,7 @@ def patient(monkeypatch):
 @pytest.mark.slow
 def test_page_in_a_browser(patient):
     tools = "probe", "grasper"
-    setting = replace(small_setting(), published_frame=ROBOT, arms=True, tools=tools)
+    setting = replace(small_setting(), published_frame=ROBOT, controller=Arms(), tools=tools)
     sink = ViewerSinkConfig(port=0).open(setting)
     shown = small_update(frames=ROBOT)
     hidden = replace(empty_update(reason="only 12 points lie in range"), published_frame=ROBOT)
@@ -130,7 +130,7 @@ def test_page_in_a_browser(patient):
 def check_arms(browser: Browser, feed: Feed, shown: TrackingResult, setting: SinkContext) -> None:
     """Arms are seen whole, with and without an estimate; what they do is said; they are stopped."""
     until(lambda: arm(browser) < 300)
-    feed.update = replace(shown, workcell=workcell())
+    feed.update = replace(shown, control=workcell())
     until(lambda: "ARMS: sweep 1" in browser.text(), "the arms' state")
     browser.click_text("arms")
     until(lambda: arm(browser) > 1000, "an arm")
@@ -143,7 +143,7 @@ def check_arms(browser: Browser, feed: Feed, shown: TrackingResult, setting: Sin
     until(lambda: arm(browser) < 300, "the view from the camera")
     browser.click_text("arms")
     until(lambda: arm(browser) > 1000, "the view of all")
-    feed.update = replace(shown, workcell=workcell(halted="the tumor has moved by 6 mm"))
+    feed.update = replace(shown, control=workcell(halted="the tumor has moved by 6 mm"))
     until(lambda: "the tumor has moved by 6 mm" in browser.text(), "the halt")
     until(lambda: "sweep 1: HALTED" in browser.text())
     browser.click_text("Stop the arms for good")

@@ -33,11 +33,11 @@ def sent(update: TrackingResult, results: ResultMessages | None = None) -> dict:
 
 def less(update: TrackingResult, *names: str) -> TrackingResult:
     """Without these shapes and lines."""
-    cell = update.workcell
+    cell = update.control
     assert cell is not None
     shapes = tuple(shape for shape in cell.shapes if shape.name not in names)
     lines = tuple(line for line in cell.lines if line.name not in names)
-    return replace(update, workcell=replace(cell, shapes=shapes, lines=lines))
+    return replace(update, control=replace(cell, shapes=shapes, lines=lines))
 
 
 # ROS
@@ -45,7 +45,7 @@ def less(update: TrackingResult, *names: str) -> TrackingResult:
 
 def test_joints_and_markers_say_where_everything_stands():
     update = working(3, 0.3)
-    out, cell = sent(update), update.workcell
+    out, cell = sent(update), update.control
     joints = out["joint_states"]
     assert dict(zip(joints.name, joints.position, strict=True)) == cell.joints_rad
     assert (stamp_of(joints.header), joints.header.frame_id) == (update.stamp_ns, "table")
@@ -111,8 +111,12 @@ def test_markers_keep_their_rate_and_changes_come_at_once():
     assert [(m.ns, m.action) for m in markers[:2]] == [("cut/2", 2), ("holder/tip", 2)]
     assert [m.ns for m in markers[2:]] == [*NAMES[:-1], "cut/1", "state"]
     cut = less(working(2, 0.3), "holder/tip", "cut/2")  # begins: the electrode's colour changes
-    assert cut.workcell is not None
-    cut = replace(cut, workcell=replace(cut.workcell, cutting=True))
+    assert cut.control is not None
+    shapes = tuple(
+        replace(shape, colour=(70, 0, 255)) if shape.name == "cutter/tip" else shape
+        for shape in cut.control.shapes
+    )
+    cut = replace(cut, control=replace(cut.control, shapes=shapes))
     assert "workcell" in sent(cut, cell)
     assert "workcell" not in sent(cut, cell)
     halted = less(working(3, 0.3, "hidden"), "holder/tip", "cut/2")
@@ -120,7 +124,7 @@ def test_markers_keep_their_rate_and_changes_come_at_once():
     assert "workcell" not in sent(halted, cell)
     (all_gone,) = sent(small_update(2, frames=TABLE), cell)["workcell"].markers
     assert all_gone.action == all_gone.DELETEALL
-    nothing = sent(replace(working(3), workcell=None), cell)
+    nothing = sent(replace(working(3), control=None), cell)
     assert len(nothing["joint_states"].name) == 0
     assert nothing["diagnostics"].status[1].level == 3  # STALE
 
@@ -146,13 +150,13 @@ def test_what_the_camera_saw_is_sent_in_the_frame_of_the_arms():
 def test_what_neither_moves_nor_deforms_is_sent_once_and_kept_for_latecomers():
     messages = ResultMessages(HUMBLE, with_arms())
     planned = tuple(
-        RigidShape(f"planned/{name}", mesh, np.eye(4), (1, 2, 3), 1.0)
+        RigidShape(f"planned/{name}", mesh, np.eye(4), (1, 2, 3), still=True)
         for name, mesh in small_update().estimate.meshes.items()
     )
 
     def out(n, *more):
-        cell = working(n, 0.1 * n).workcell
-        update = replace(working(n), workcell=replace(cell, shapes=(*more, *cell.shapes)))
+        cell = working(n, 0.1 * n).control
+        update = replace(working(n), control=replace(cell, shapes=(*more, *cell.shapes)))
         return {one.suffix: one for one in messages.of(update)}
 
     first = out(0, *planned)
@@ -193,7 +197,7 @@ def test_tips_and_the_arms_state_go_to_slicer(slicer):
     sink.publish(update)
     heard = hear_all(receiver, 6 + 3)
     assert status_by_the_book(heard["STATUS", "arms"].content) == IgtlStatus(1, "sweep 1", "")
-    shapes = {shape.name: shape for shape in update.workcell.shapes}
+    shapes = {shape.name: shape for shape in update.control.shapes}
     for name in ("cutter/tip", "holder/tip"):
         place = unpack_transform(heard["TRANSFORM", name].content)
         x, y, z = shapes[name].published_from_shape[:3, 3]

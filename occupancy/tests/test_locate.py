@@ -21,8 +21,9 @@ from tumortrack.io.case import load_case
 from tumortrack.io.mesh_files import read_mesh
 from tumortrack.report.inspection import describe
 from tumortrack.report.protocol import check_case
+from tumortrack.tracking.follower import Follower, FollowerConfig
 from tumortrack.tracking.model_files import load_model
-from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
+from tumortrack.tracking.tracker import Tracker
 from tumortrack_occupancy.locator import OccupancyLocator
 
 pytestmark = pytest.mark.slow

@@ -18,7 +18,6 @@ from plan_objects import RADIUS_MM, TUMOR_MM, located, sphere
 from reports import bounded, reporting
 from tumortrack.core.assessment import ErrorBound
 from tumortrack.core.errors import InputError, NoPlan
-from tumortrack.core.halt import Halt
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.values import TrackingResult
 from tumortrack_resection.budget import (
@@ -35,6 +34,7 @@ from tumortrack_resection.budget import (
 )
 from tumortrack_resection.drafts import plan_resection
 from tumortrack_resection.facets import Tools
+from tumortrack_resection.halt import Halt
 from tumortrack_resection.ur_sink import OFF_MM
 from tumortrack_resection.values import (
     ELECTRODE,
@@ -264,6 +264,7 @@ def test_a_new_plan_helps_where_the_motion_alone_is_too_much():
     accepted = Live(budget(1.0, motion_mm=2))
     assert accepted.add_up(update(0), 1.9, 1.0) == (None, False)
     assert accepted.now.left_mm < 0
+    assert f"{-accepted.now.left_mm:.1f} mm" in accepted.now.left_words
 
 
 def test_live_every_tumor_counts():

@@ -16,9 +16,9 @@ from live_objects import small_update
 from plan_objects import RADIUS_MM, TUMOR_MM, located, sphere
 from reports import bounded
 from tumortrack.core.errors import InputError, NoPlan
-from tumortrack.core.halt import CUT_NOTE, Halt
 from tumortrack_resection.budget import ErrorBudget, LiveBudget
 from tumortrack_resection.drafts import plan_resection
+from tumortrack_resection.halt import CUT_NOTE, Halt
 from tumortrack_resection.motions import JOINTS, Execution, Motions, MotionStage, Stage
 from tumortrack_resection.operation import (
     Following,
@@ -223,7 +223,7 @@ class World:
         if self.waits:  # in the world's time, planning takes no longer than a frame
             wait(self.plans)
         update = replace(GOOD, **changes)
-        return self.operation.act(update, self.now_s).workcell
+        return self.operation.act(update, self.now_s).control
 
     @property
     def joints_rad(self):
@@ -239,7 +239,7 @@ class World:
             cell = self.frame(**changes)
             if plain(cell) == state:
                 return cell
-        raise AssertionError(f"never {state}, but {cell.state}: {cell.halted}")
+        raise AssertionError(f"never {state}, but {cell.state}: {cell.stopped}")
 
 
 def test_a_whole_procedure_on_an_organ_that_keeps_still():
@@ -252,7 +252,7 @@ def test_a_whole_procedure_on_an_organ_that_keeps_still():
         assert cell.halt is None
         assert set(cell.joints_rad) == set(JOINTS)
     assert tuple(states) == (*STATES, Stage.DONE)
-    log = world.operation.summary()["log"]
+    log = world.operation.summary()["resection"]["log"]
     assert [entry["state"] for entry in log] == [*STATES, Stage.DONE]
     assert 7.8 < log[-1]["at_s"] < 8.6  # eight stages of a second, and a soft start
 
@@ -289,7 +289,7 @@ def test_without_a_word_from_the_loop_the_arms_halt_by_themselves():
     world.frame(seconds=5.0)  # the loop hung
     moved = np.abs(world.joints_rad - before).max()
     assert 0 < moved < 0.2 * 0.5  # rad: no more than 0.2 s and the brake's way of 0.2 rad/s ...
-    assert world.operation.summary()["state"] == "approach"
+    assert world.operation.summary()["resection"]["state"] == "approach"
 
 
 def test_a_tumor_that_moved_is_planned_anew_once_it_has_settled():
@@ -352,7 +352,7 @@ def test_a_tumor_that_moves_while_the_instrument_withdraws_loses_no_sweep():
 def test_after_the_first_sweep_began_results_are_marked_and_nothing_is_planned_unasked():
     world = World()
     assert "intact" not in world.until("hold").state
-    assert world.operation.summary()["note"] == ""
+    assert world.operation.summary()["resection"]["note"] == ""
     assert world.until("sweep 1").state == f"sweep 1 ({CUT_NOTE})"
     world.shift = np.array([0.0, 0.0, 4.0])
     cell = world.frames(200)
@@ -363,7 +363,7 @@ def test_after_the_first_sweep_began_results_are_marked_and_nothing_is_planned_u
     assert not world.calls
     world.shift = np.zeros(3)
     world.until(Stage.DONE)
-    assert world.operation.summary()["note"] == CUT_NOTE
+    assert world.operation.summary()["resection"]["note"] == CUT_NOTE
 
 
 @pytest.mark.parametrize("part", ["kidney", "tumor_1", "tumor_2"])
@@ -450,12 +450,17 @@ def test_arms_stand_while_the_errors_exceed_the_margin_and_go_on_when_they_shrin
         "term": "tracking", "term_mm": 12.0,
     }  # fmt: skip
     assert cell.left_mm < 0
-    assert world.frame(**changes).joints_rad == cell.joints_rad
+    assert cell.stopped == cell.halt.words
+    assert all(words and words in cell.line for words in (cell.state, cell.stopped, cell.note))
+    changes = off_by(12.5)
+    worse = world.frame(**changes)
+    assert worse.joints_rad == cell.joints_rad
+    assert (worse.kind, worse.line != cell.line) == (cell.kind, True)  # other numbers alone
     assert not world.plans  # a new plan would not help
     changes = off_by(4.5)
     assert world.frames(2, **changes).halt is None
     world.until(Stage.DONE, **changes)
-    budgets = world.operation.summary()["budget"]
+    budgets = world.operation.summary()["resection"]["budget"]
     assert budgets["planned"]["sum_mm"] == pytest.approx(INDEPENDENT_MM)
     assert budgets["worst"]["tracking_mm"] == 4.5  # of those on which the arms went on
     assert budgets["worst"]["left_mm"] > 0
@@ -544,7 +549,7 @@ def test_what_a_new_plan_warns_of_is_said_with_every_state_from_then_on():
     cell = world.until("sweep 1")
     assert NO_ROOM in cell.state
     assert OVER_BUDGET in cell.state  # which a person accepted, for all plans
-    assert NO_ROOM in world.operation.summary()["note"]
+    assert NO_ROOM in world.operation.summary()["resection"]["note"]
 
 
 def test_surfaces_of_other_triangles_are_compared_by_their_distance():

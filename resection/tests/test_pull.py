@@ -93,7 +93,7 @@ class Procedure:
 
     def frame(self, update=None):
         self.now_s += 0.02
-        return self.operation.act(update or seen(), self.now_s).workcell
+        return self.operation.act(update or seen(), self.now_s).control
 
     def until(self, state):
         for _ in range(900):

@@ -33,7 +33,6 @@ from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.halt import CUT_NOTE
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import CameraLabels, OccupancyCloud
 from tumortrack.io.case import load_case
@@ -43,6 +42,7 @@ from tumortrack.io.run_folder import write_estimate
 from tumortrack_resection import begin_plan, begin_resection, plan_resection
 from tumortrack_resection.arms.body import cell_urdf
 from tumortrack_resection.files import read_plan
+from tumortrack_resection.halt import CUT_NOTE
 from tumortrack_resection.motions import JOINTS
 from tumortrack_resection.values import CUTS_TUMOR, ELECTRODE, OVER_BUDGET, POOR_ESTIMATE, UNCHECKED
 
@@ -244,7 +244,7 @@ def test_the_papers_method_says_how_deep_it_cuts_the_tumor_and_moves_no_real_arm
     assert warning in output
     (budget,) = stored.budgets
     assert budget.margin_mm == -deep_mm
-    assert begin_resection(folder).operation.summary()["note"].startswith(CUTS_TUMOR)
+    assert begin_resection(folder).operation.summary()["resection"]["note"].startswith(CUTS_TUMOR)
     live = ("--live", given / "model", "realsense")
     done = tumortrack("resect", folder, REAL, *STATED, *live)
     assert missing(done) == {"method", "budget", "person"}

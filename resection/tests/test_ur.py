@@ -18,6 +18,7 @@ from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.packages import to_install
 from tumortrack.live.spec import SINKS
 from tumortrack_resection.ur_sink import SILENT_S, UR_JOINTS, UrSink, UrSinkConfig
+from tumortrack_resection.workcell import Workcell
 from workcell_objects import with_arms, workcell, working
 
 # A fake controller of a real arm, which records its calls.
@@ -162,10 +163,10 @@ def test_targets_that_an_arm_must_not_follow_are_refused(monkeypatch, joints, wo
     sink = UrSinkConfig(host="10.0.0.9").open(with_arms())
     sink.publish(working(0))
     update = working(1)
-    assert update.workcell is not None
-    changed = {k: v for k, v in (update.workcell.joints_rad | joints).items() if v is not None}
+    assert update.control is not None
+    changed = {k: v for k, v in (update.control.joints_rad | joints).items() if v is not None}
     with pytest.raises(TumortrackError, match=words):
-        sink.publish(replace(update, workcell=replace(update.workcell, joints_rad=changed)))
+        sink.publish(replace(update, control=replace(update.control, joints_rad=changed)))
     assert sink.counts == {"would send": 1, "refused": 1}
 
 
@@ -213,7 +214,7 @@ def test_an_arm_that_begins_beside_its_target_joins_the_plan_slowly(arm, moving,
 
 def cutting(number, yes):
     result = working(number)
-    return replace(result, workcell=replace(result.workcell, cutting=yes))
+    return replace(result, control=Workcell(**vars(result.control), cutting=yes))
 
 
 def test_on_a_cut_the_tools_tip_is_where_it_should_be_to_2_mm(arm, moving):
@@ -320,12 +321,12 @@ def test_an_arm_may_be_behind_by_the_time_it_looks_ahead(arm, monkeypatch, behin
     sink = UrSinkConfig(host="10.0.0.9", execute=True).open(with_arms())
     results = []
     for n in range(3):
-        cell = working(0).workcell
+        cell = working(0).control
         assert cell is not None
         turned = {name: rad + n * np.radians(0.2) for name, rad in cell.joints_rad.items()}
         stamp_ns = 10**9 + n * 20_000_000
         results.append(
-            replace(working(0), stamp_ns=stamp_ns, workcell=replace(cell, joints_rad=turned))
+            replace(working(0), stamp_ns=stamp_ns, control=replace(cell, joints_rad=turned))
         )
     sink.publish(results[0])
     sink.publish(results[1])

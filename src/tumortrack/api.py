@@ -46,8 +46,9 @@ from tumortrack.tracking.options import (
 
 if TYPE_CHECKING:
     from tumortrack.io.scene_folder import Scene
-    from tumortrack.live.session import Arms, Session
-    from tumortrack.live.values import TrackingResult
+    from tumortrack.live.cameras import CameraSetup
+    from tumortrack.live.session import Session
+    from tumortrack.live.values import Controller, TrackingResult
     from tumortrack.registration.base_model import Model, ModelConfig
     from tumortrack.registration.method import TrainingStatus
     from tumortrack.report.locating import Located
@@ -595,13 +596,14 @@ def session(
     tracker: Tracker | StrPath,
     source: Any,
     sinks: Sequence[Any] = (),
-    arms: Arms | None = None,
+    controller: Controller | None = None,
+    setup: CameraSetup | None = None,
     **options: Unpack[SessionKeywords],
 ) -> Session:
     """``track``, ready to be opened: for programs that show what happens meanwhile, as the command
-    does. ``arms`` act on what is tracked."""
+    does. ``controller`` and ``setup`` as of ``Session``."""
     from tumortrack.live.session import Session
 
     asked = options_from(TrackOptions, {**options}, "track")
     model = Path(tracker) if isinstance(tracker, str | Path) else tracker
-    return Session(model, source, sinks, asked, arms)
+    return Session(model, source, sinks, asked, controller, setup)

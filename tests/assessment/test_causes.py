@@ -22,8 +22,9 @@ from tumortrack.io.run_folder import report_entry
 from tumortrack.simulation.deform import DragConfig
 from tumortrack.simulation.phantom.digital import PhantomParameters, phantom_labels
 from tumortrack.simulation.scene import SceneRecipe, Simulator
+from tumortrack.tracking.follower import Follower, FollowerConfig
 from tumortrack.tracking.model_files import load_model
-from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
+from tumortrack.tracking.tracker import Tracker
 
 BASE_MM, TILT = [450.0, -120.0, 260.0], Rotation.from_euler("xz", [165, 40], degrees=True)
 SPOILT = {

@@ -24,8 +24,9 @@ from tumortrack.core.types import DepthFrame, Mesh, PointNoise, SensorCloud
 from tumortrack.io.model_folder import weakness_of
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.simulation.scene import SceneRecipe, Simulator, body_for
+from tumortrack.tracking.follower import Follower, FollowerConfig
 from tumortrack.tracking.model_files import load_model
-from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
+from tumortrack.tracking.tracker import Tracker
 from warp_objects import ANATOMY, PLACE_MM, TURNED, slim_clinic
 
 CAMERA = d405(424, 240)

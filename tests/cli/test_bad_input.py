@@ -108,7 +108,7 @@ def test_an_unreadable_input_is_named_and_no_folder_stays(tmp_path, monkeypatch)
 def test_the_papers_method_names_its_package_where_it_is_not_installed(
     arguments, phantom_case, tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr("tumortrack.registration.method.entry_points", lambda group: [])
+    monkeypatch.setattr("tumortrack.core.plugins.entry_points", lambda group: [])
     out = str(tmp_path / "out")
     places = ["--out", out] if arguments[0] == "demo" else [str(phantom_case), out]
     assert run([*arguments, *places]) == 2

@@ -1,6 +1,9 @@
 """Core: transforms, values and configuration."""
 
 import json
+import tomllib
+from importlib.resources import files
+from typing import get_args
 
 import jaxtyping
 import msgspec
@@ -19,6 +22,7 @@ from tumortrack.core.geometry import (
     rotation_onto,
     transform_points,
 )
+from tumortrack.core.report import Kind
 from tumortrack.core.types import (
     Anatomy,
     Intrinsics,
@@ -177,3 +181,8 @@ def test_wrong_configuration_is_refused_by_name(data, says):
         from_builtins(data, Outer, "run.json")
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert(data, Outer)
+
+
+def test_every_kind_of_finding_has_one_sentence():
+    findings = tomllib.loads(files("tumortrack.core").joinpath("findings.toml").read_text("utf-8"))
+    assert sorted(kind for part in findings.values() for kind in part) == sorted(get_args(Kind))

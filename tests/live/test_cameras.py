@@ -198,7 +198,7 @@ def test_options_that_do_not_go_together_are_refused(tmp_path):
 
 
 class Holding:
-    """Arms that hold something in every frame, at the frame's time."""
+    """A controller that holds something in every frame, at the frame's time."""
 
     ended = False
 
@@ -209,18 +209,18 @@ class Holding:
     def act(self, result):
         return result
 
-    def abort(self, halt):
+    def stop(self, why, words=""):
         self.ended = True
 
     def summary(self):
         return {}
 
 
-def test_what_arms_hold_goes_into_each_frames_estimate_in_its_cameras_frame():
-    tracker, arms = Located(), Holding()
-    told, _ = played([Tape(0, 33, 66)], [BASE], tracker=tracker, arms=arms)
+def test_what_a_controller_holds_goes_into_each_frames_estimate_in_its_cameras_frame():
+    tracker, controller = Located(), Holding()
+    told, _ = played([Tape(0, 33, 66)], [BASE], tracker=tracker, controller=controller)
     held = [piece for _, evidence in tracker.asked for piece in evidence]
     assert [piece.stamp_ns for piece in held] == [one.stamp_ns for one in told[:3]]
-    for piece in held:  # the origin of the arms' frame
+    for piece in held:  # the origin of the published frame
         np.testing.assert_allclose(piece.place_mm, np.linalg.inv(BASE)[:3, 3])
-    assert arms.ended  # stopped for good where tracking ends
+    assert controller.ended  # stopped for good where tracking ends

@@ -100,13 +100,13 @@ def test_a_broken_package_breaks_its_own_kind_alone(example, tmp_path, monkeypat
             SINKS.parse(kind)
     with pytest.raises(InputError, match=r"csv, lost, moveit, number, openigtlink, .*viewer"):
         SINKS.parse("screen")
-    faults = {(one.package, one.kind): one.fault for one in extensions()}
+    faults = {(one.package, one.name): one.fault for one in extensions()}
     assert faults["tumortrack-example", "csv"] == faults["tumortrack-example", "image"] == ""
     assert all(fault for (package, _), fault in faults.items() if package == "acme-sinks")
 
 
 def test_a_kind_of_ours_that_is_not_installed_is_named_with_its_package(monkeypatch, tmp_path):
-    monkeypatch.setattr("tumortrack.live.spec.entry_points", lambda group: [])
+    monkeypatch.setattr("tumortrack.core.plugins.entry_points", lambda group: [])
     for registry, kind, package in (
         (SOURCES, "realsense", "tumortrack-devices[realsense]"),
         (SINKS, "ur", "tumortrack-resection[ur]"),

@@ -17,8 +17,9 @@ from tumortrack.live.values import Controls, PublishedFrame, SinkContext
 from tumortrack.live.workers import SourceWorker
 from tumortrack.segmentation import RegionConfig
 from tumortrack.simulation.scene import SceneRecipe, Simulator, body_for
+from tumortrack.tracking.follower import Follower, FollowerConfig
 from tumortrack.tracking.model_files import load_model
-from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
+from tumortrack.tracking.tracker import Tracker
 from warp_objects import ANATOMY, slim_clinic
 
 FRAME_NS = 33_000_000

@@ -25,7 +25,7 @@ from tumortrack.live.tools import Tool, ToolConfig, Tools
 from tumortrack.live.values import CameraView, Observation
 from tumortrack.live.views import ViewsLocator
 from tumortrack.segmentation import RegionConfig
-from tumortrack.tracking.tracker import Follower
+from tumortrack.tracking.follower import Follower
 
 SETTING = replace(small_setting(), anatomy_ct=small_anatomy())
 ONE, TWO = (Touch(place_mm=(0.0, y, 120.0), tool="probe") for y in (1.0, 2.0))

@@ -28,8 +28,9 @@ from tumortrack.io.evidence_files import evidence_json, read_evidence
 from tumortrack.io.ply import write_cloud_ply
 from tumortrack.registration.evidence import EvidenceTerms, Known, still_known
 from tumortrack.registration.looks import Looks
+from tumortrack.tracking.follower import Follower, FollowerConfig
 from tumortrack.tracking.model_files import load_model
-from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
+from tumortrack.tracking.tracker import Tracker
 from warp_objects import ANATOMY, method, nudged, placed, shape
 
 NAMES = ANATOMY.names

@@ -31,8 +31,9 @@ from tumortrack.registration.looks import CAMERA_STD, Looks
 from tumortrack.registration.motion import seen_from_first
 from tumortrack.registration.search import PosePrior, Search
 from tumortrack.segmentation import RegionConfig
+from tumortrack.tracking.follower import Follower, FollowerConfig
 from tumortrack.tracking.model_files import load_model
-from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
+from tumortrack.tracking.tracker import Tracker
 from warp_objects import ANATOMY, PLACE_MM, nudged, placed, shape
 
 CAMERA, SMALL = d405(424, 240), d405(320, 180)

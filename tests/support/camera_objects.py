@@ -105,7 +105,7 @@ def once(source):
 
 
 def played(
-    sources, places=(HERE,), published=None, tracker=None, config=None, arms=None, sink=None
+    sources, places=(HERE,), published=None, tracker=None, config=None, controller=None, sink=None
 ):
     """The loop's results over sources (one try each), and its report."""
     tracker = tracker or Located()
@@ -115,10 +115,10 @@ def played(
         published,
         tracker.anatomy_ct,
         cameras=() if hasattr(places, "at") else tuple(places),
-        arms=arms is not None,
+        controller=controller,
     )
     config = config or LoopConfig(region=ALL, stale_s=PATIENCE_S / 2)
-    loop, told = Loop(tracker, context, config, arms), []
+    loop, told = Loop(tracker, context, config), []
     cameras = Cameras([SourceWorker(once(source)) for source in sources], places)
     outlets = [] if sink is None else [SinkWorker("notes", sink, 1000)]
     try:

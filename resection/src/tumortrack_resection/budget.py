@@ -19,12 +19,12 @@ from jaxtyping import Float64
 from tumortrack.core.assessment import ErrorBound
 from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.errors import InputError, NoPlan
-from tumortrack.core.halt import Halt
 from tumortrack.core.mesh_query import contains, nearest_places
 from tumortrack.core.organ import organ_name
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import TrackingResult
 from tumortrack_resection.facets import TOOLS, Tools
+from tumortrack_resection.halt import Halt
 from tumortrack_resection.ur_sink import OFF_MM
 from tumortrack_resection.values import (
     MARGIN_MM,
@@ -95,6 +95,12 @@ class ErrorBudget(Config, frozen=True, kw_only=True):
     def left_mm(self) -> float:
         """Of the margin; negative: the tumor may be cut."""
         return self.margin_mm - self.sum_mm
+
+    @property
+    def left_words(self) -> str:
+        if self.left_mm < 0:
+            return f"errors exceed the distance to {self.part} by {-self.left_mm:.1f} mm"
+        return f"{self.left_mm:.1f} mm or more are left of the distance to each tumor"
 
     @property
     def as_halt(self) -> Halt:

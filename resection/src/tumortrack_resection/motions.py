@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.halt import Halt
+from tumortrack_resection.halt import Halt
 from tumortrack_resection.ur_sink import UR_JOINTS
 
 CUTTER, HOLDER = "cutter", "holder"  # UR10e with the instrument, UR5 with the vacuum grasper

@@ -22,13 +22,14 @@ from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.evidence import Evidence
 from tumortrack.core.geometry import Affine, transform_points
-from tumortrack.core.halt import CUT_NOTE, Halt
 from tumortrack.core.types import Mesh
-from tumortrack.live.values import Polyline, RigidShape, TrackingResult, Workcell
+from tumortrack.live.values import Polyline, RigidShape, StopReason, TrackingResult
 from tumortrack_resection.budget import MOVED_MM, LiveBudget
 from tumortrack_resection.grip import Grip
+from tumortrack_resection.halt import CUT_NOTE, Halt
 from tumortrack_resection.motions import CUTTER, JOINTS, Execution, Joints, Motions, Stage
 from tumortrack_resection.values import ELECTRODE, Located, ResectionPlan
+from tumortrack_resection.workcell import TipOf, Workcell, stage_words
 
 _OTHER_PARTS = 2.0  # they may move so many times as far as the tumor
 _COMPARED = 500  # points of surfaces with different triangles
@@ -100,20 +101,23 @@ class Following(NamedTuple):
     """What an operation that follows the organ needs. ``locate``: an update's estimate in the
     table's frame; None: estimates are ignored. ``replan``: begins a new plan in another process.
     ``budget``: adds up the errors. ``grip``: what the holder holds, as evidence. ``reach``:
-    touches are advised where the arms can take them."""
+    touches are advised where the arms can take them. ``tip_mm``: where their tools are. ``real``:
+    there are sinks of real arms, connected or not."""
 
     locate: Locate | None = None
     replan: Replan | None = None
     budget: LiveBudget | None = None
     grip: Grip | None = None
     reach: ReachOf | None = None
+    tip_mm: TipOf | None = None
+    real: bool = False
 
 
 _UNSEEING = Following()
 
 
 class Operation:
-    """``live.values.ArmsController``: arms that act on estimates. ``draw``: arms, table and
+    """``live.values.Controller``: arms that act on estimates. ``draw``: arms, table and
     tools as shapes, from twelve joint angles. ``static_shapes``: drawn with every update.
     ``log``: states and when they began. ``halts``: how often each reason halted the arms."""
 
@@ -123,7 +127,8 @@ class Operation:
         self.planned, self._config = planned, config
         self._warnings = planned.plan.warnings  # also of later plans: the budget stays accepted
         self._draw = draw
-        self._locate, self._replan, self._budget, self._grip, self._reach = live
+        self._locate, self._replan, self._budget, self._grip, self._reach = live[:5]
+        self.tip_mm, self._real = live.tip_mm, live.real
         self._execution = Execution(planned.motions)
         self._last_s: float | None = None
         self._first_s = 0.0
@@ -159,7 +164,7 @@ class Operation:
         if halt is not None and reason != self._counted:
             self.halts[halt.words_without_numbers] += 1
         self._counted = reason
-        return replace(update, workcell=self.workcell(), estimate=self._advised(update))
+        return replace(update, control=self.workcell(), estimate=self._advised(update))
 
     def _advised(self, update: TrackingResult) -> Estimate | None:
         """The estimate with advice that the arms can follow; with none while they are at work."""
@@ -189,9 +194,9 @@ class Operation:
     def halt(self) -> Halt | None:
         return self._execution.halted
 
-    def abort(self, halt: Halt) -> None:
-        """Stop for good, from any state."""
-        self._execution.abort(halt)
+    def stop(self, why: StopReason, words: str = "") -> None:
+        """For good, from any state."""
+        self._execution.abort(Halt(why, {"words": words}))
 
     def workcell(self) -> Workcell:
         execution, plan = self._execution, self.planned.plan
@@ -202,20 +207,30 @@ class Operation:
             lines.append(Polyline(f"cut/{number}", cut.path_mm, colour, 0.8))
         above = plan.grasp_mm + np.outer([40.0, 0.0], plan.lift)
         lines.append(Polyline("grasp", above, (90, 200, 255), 0.8))
-        named = dict(zip(JOINTS, joints.tolist(), strict=True))
         drawn = self._draw(joints)
         if execution.cutting:
             drawn = tuple(
                 replace(each, colour=ENERGISED) if each.name == _ELECTRODE else each
                 for each in drawn
             )
-        shapes = (*self.static_shapes, *drawn)
         state = f"{execution.state} ({self._note})" if self._note else execution.state
         now = None if self._budget is None else self._budget.now
-        left_mm, left_to = (None, "") if now is None else (now.left_mm, now.part)
-        cutting = execution.cutting
-        halt, drawn_lines = execution.halted, tuple(lines)
-        return Workcell(state, halt, named, shapes, drawn_lines, left_mm, left_to, cutting)
+        halt, note = execution.halted, "" if now is None else now.left_words
+        stopped = "" if halt is None else halt.words
+        line = f"arms: {stage_words(state, self._real)}" + (f" ({stopped})" if stopped else "")
+        return Workcell(
+            state,
+            stopped,
+            note,
+            line="; ".join(filter(None, (line, note))),
+            kind=(state, halt and halt.same_as),
+            joints_rad=dict(zip(JOINTS, joints.tolist(), strict=True)),
+            shapes=(*self.static_shapes, *drawn),
+            lines=tuple(lines),
+            halt=halt,
+            left_mm=None if now is None else now.left_mm,
+            cutting=execution.cutting,
+        )
 
     @property
     def _note(self) -> str:
@@ -227,7 +242,7 @@ class Operation:
         return "; ".join([*heads, *([CUT_NOTE] if self._cut and self._locate is not None else [])])
 
     def summary(self) -> dict[str, Any]:
-        return {
+        resection = {
             "state": self._execution.state,
             "note": self._note,
             "halted": self._execution.halted.words if self._execution.halted else "",
@@ -235,6 +250,7 @@ class Operation:
             "log": self.log,
             **({} if self._budget is None else {"budget": self._budget.summary()}),
         }
+        return {"resection": resection}
 
     def _advance(self, now_s: float) -> None:
         if self._last_s is None:

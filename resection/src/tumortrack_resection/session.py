@@ -23,16 +23,14 @@ from tumortrack.core import store
 from tumortrack.core.colours import part_colour
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import ArtifactError, InputError, NoPlan
-from tumortrack.core.halt import Halt
 from tumortrack.core.organ import KIDNEY, Organ, organ_first, organ_name
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.io.model_folder import patient_of
 from tumortrack.live.cameras import CameraSetup
-from tumortrack.live.session import Arms, Session, check_report, named_sinks, open_sinks
+from tumortrack.live.session import Session, check_report, named_sinks, open_sinks
 from tumortrack.live.spec import SOURCES
 from tumortrack.live.values import (
-    PLANNED,
     Controls,
     RigidShape,
     SinkConfig,
@@ -184,20 +182,21 @@ class ResectionSession:
             warming_up.result()
             late_s = max((arm.lookahead_s for arm in self.arms), default=0.0)
             budget = LiveBudget(stored.budgets, late_s)
-            reach = partial(ArmsReach, cell.config)
-            grip = Grip(tip_places(cell.config), held_std_mm(stored.budgets[0]))
-            self.operation = self._operation(
-                stored.plan, self._config, Following(locate, replan, budget, grip, reach)
-            )
+            reach, tip_mm = partial(ArmsReach, cell.config), tip_places(cell.config)
+            grip = Grip(tip_mm, held_std_mm(stored.budgets[0]))
+            following = Following(locate, replan, budget, grip, reach, tip_mm, bool(self.arms))
+            self.operation = self._operation(stored.plan, self._config, following)
             source = live.source
             if isinstance(source, VirtualSourceConfig) and source.pulled is not None:
                 source = _Pulled(virtual=source, pull_mm=lambda: grip.pulled_mm)
             setup = CameraSetup(frames, {live.source_text: source})
-            about = {"plan_config": to_builtins(self._config)}
-            arms = Arms(self.operation, setup, about, tip_places(cell.config), bool(self.arms))
             names = ("report", *(field.name for field in fields(CameraOptions)))
             options = {name: getattr(self._options, name) for name in names}
-            yield api.session(live.model, live.source_text, self._given_sinks, arms, **options)
+            session = api.session(
+                live.model, live.source_text, self._given_sinks, self.operation, setup, **options
+            )
+            session.about["plan_config"] = to_builtins(self._config)
+            yield session
 
     @contextmanager
     def opened(self) -> Iterator[None]:
@@ -211,7 +210,7 @@ class ResectionSession:
             check_report(report)
         self._controls = Controls()
         context = SinkContext(
-            tuple(stored.meshes), stored.frames, None, self._controls, True, stored.patient
+            tuple(stored.meshes), stored.frames, None, self._controls, operation, stored.patient
         )
         with open_sinks(named_sinks(self._given_sinks), context) as self.sinks:
             yield
@@ -221,7 +220,7 @@ class ResectionSession:
                 "patient": to_builtins(stored.patient),
                 "plan": {"tumor": plan.tumor, "method": plan.method, "warnings": plan.warnings},
                 "frame": stored.frames.frame_id,
-                "resection": operation.summary(),
+                **operation.summary(),
                 "sinks": {sink.name: sink.summary() for sink in self.sinks},
             }
             store.write_json(report, content)
@@ -232,7 +231,7 @@ class ResectionSession:
         frames, started_s = self.stored.frames, time.monotonic()
         for sequence in itertools.count():
             if self._controls.aborted.is_set():
-                self.operation.abort(Halt("aborted"))
+                self.operation.stop("aborted")
             untracked = TrackingResult(
                 sequence, time.time_ns(), reason=_PLAYBACK, published_frame=frames, playback=True
             )
@@ -246,7 +245,7 @@ class ResectionSession:
 
     def stop(self) -> None:
         """The user stops the arms for good."""
-        self.operation.abort(Halt("interrupted"))
+        self.operation.stop("interrupted")
 
     def film(self, path: Path, progress: Callable[[int, int], None] = lambda n, of: None) -> float:
         """Write the stored plan as an animated GIF, see ``film.film``; returns its length in s.
@@ -426,6 +425,6 @@ def _organ_shapes(stored: PlanFolder) -> tuple[RigidShape, ...]:
     meshes[0] = Mesh(meshes[0].vertices_mm, bare_faces(Anatomy(tuple(meshes))))
     opacity, still = [0.35] + [1.0] * len(names), np.eye(4)
     return tuple(
-        RigidShape(f"{PLANNED}{name}", mesh, still, part_colour(n + 1), opacity[n])
+        RigidShape(f"planned/{name}", mesh, still, part_colour(n + 1), opacity[n], still=True)
         for n, (name, mesh) in enumerate(zip(names, meshes, strict=True))
     )

@@ -16,7 +16,8 @@ from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.packages import to_install
-from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
+from tumortrack.live.values import Controls, SinkConfig, SinkContext, TrackingResult
+from tumortrack_resection.workcell import Arms, TipOf, Workcell
 
 UR_JOINTS = (
     *("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"),
@@ -85,11 +86,13 @@ class UrSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ur"):
     def open(self, context: SinkContext) -> UrSink:
         """Nothing, or with ``execute`` the connection to the arm, which does not move yet.
         InputError: no arms in this run; with ``execute``: as ``UrLink``."""
-        if not context.arms:
+        arms = context.controller
+        if arms is None:
             raise InputError("ur: nothing here moves an arm; it is for `tumortrack resect`.")
-        if self.execute and context.tip_mm is None:
+        tip_mm = arms.tip_mm if isinstance(arms, Arms) else None
+        if self.execute and tip_mm is None:
             raise InputError("ur: nothing says where the arm's tool is; use `tumortrack resect`.")
-        return UrSink(self, UrLink(self.host) if self.execute else None, context)
+        return UrSink(self, UrLink(self.host) if self.execute else None, context.controls, tip_mm)
 
 
 class _Sent(NamedTuple):
@@ -112,9 +115,11 @@ class UrSink:
     reaches within a second. On a cut the tool's tip must be within 2 mm of its target. If this
     process dies, the arm's controller stops the arm within 0.2 s (setWatchdog)."""
 
-    def __init__(self, config: UrSinkConfig, link: UrLink | None, context: SinkContext) -> None:
+    def __init__(
+        self, config: UrSinkConfig, link: UrLink | None, controls: Controls, tip_mm: TipOf | None
+    ) -> None:
         self._config, self._link = config, link
-        self._controls, self._tip_mm = context.controls, context.tip_mm
+        self._controls, self._tip_mm = controls, tip_mm
         self._cutting = False
         self._names = tuple(f"{config.arm}_{joint}" for joint in UR_JOINTS)
         self._last: _Sent | None = None  # None: the arm stands still
@@ -144,15 +149,16 @@ class UrSink:
             if trouble := self._fault or self._trouble:
                 self._trouble = ""
                 raise TumortrackError(trouble)
-            cell = result.workcell
+            cell = result.control
             with self._failing_safe():
-                if cell is None or cell.halted:
+                if cell is None or cell.stopped:
                     self._counts["no arms" if cell is None else "halted"] += 1
                     self._stop()
                 else:
                     self._stop_if_silent()
                     # After a standstill on a cut, the next motion begins on the cut.
-                    self._cutting = cell.cutting or (self._cutting and self._last is None)
+                    cutting = isinstance(cell, Workcell) and cell.cutting
+                    self._cutting = cutting or (self._cutting and self._last is None)
                     self._send(_target(cell.joints_rad, self._names), result.stamp_ns)
 
     def close(self) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, entry_points, requires, version
+from importlib.metadata import PackageNotFoundError, requires, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
@@ -20,9 +20,9 @@ from tyro.conf import Positional
 from tumortrack.cli.console import Device, say
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.packages import to_install
+from tumortrack.core.plugins import plugins
 from tumortrack.core.process import available_cores
 from tumortrack.native import LIBRARIES, library
-from tumortrack.registration.method import GROUP
 
 # What each distribution is for, and each of its extras; "": what it always needs.
 PURPOSES = {
@@ -83,9 +83,9 @@ class Doctor:
             say(f"{state:8} {text}")
             broken += state == "BROKEN"
 
-        for point in entry_points(group=GROUP):
+        for method in plugins("methods"):
             with suppress(Exception):  # what fails is among the findings
-                for line in point.load().hardware():
+                for line in method.loaded.hardware():
                     say(line)
         if broken:
             raise TumortrackError(
@@ -113,19 +113,12 @@ def _plug_ins() -> Iterator[Status]:
     from tumortrack.live import spec
     from tumortrack.simulation.deform import installed
 
-    added = [(f"{e.what} {e.kind}", e.package, e.fault) for e in spec.extensions()]
-    added += [(f"deformation {e.name}", e.package, e.fault) for e in installed.extensions()]
-    for what in ("command", "method"):
-        for point in entry_points(group=f"tumortrack.{what}s"):
-            try:
-                point.load()
-            except Exception as error:  # a foreign package raises anything
-                added.append((f"{what} {point.name}", point.value, str(error)))
-    for what, package, fault in added:
-        text = f"{what} of the package {package}"
-        if fault:
-            yield "BROKEN", f"{text}: {fault}"
-        elif (package, "") not in PURPOSES:
+    others = (each for group in ("commands", "methods") for each in plugins(group) if each.fault)
+    for each in (*spec.extensions(), *installed.extensions(), *others):
+        text = f"{each.kind} {each.name} of the package {each.package}"
+        if each.fault:
+            yield "BROKEN", f"{text}: {each.fault}"
+        elif (each.package, "") not in PURPOSES:
             yield "ok", text
 
 

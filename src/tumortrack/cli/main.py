@@ -104,21 +104,20 @@ def _commands(chosen: str) -> dict[str, Callable[..., Command]]:
     (entry points ``tumortrack.commands``)."""
     if chosen in _MODULES:
         return {chosen: _ours(chosen)}
-    from importlib.metadata import entry_points
+    from tumortrack.core.plugins import plugins
 
-    others = sorted(entry_points(group="tumortrack.commands"), key=lambda point: point.name)
-    if alone := [point for point in others if point.name == chosen]:
-        commands, others = {}, alone
-    else:
+    commands: dict[str, Callable[..., Command]] = {}
+    others = list(plugins("commands", name=chosen))
+    if not others:
         commands = {name: _ours(name) for name in _MODULES}
-    for point in others:
-        try:
-            commands[point.name] = point.load()
-        except Exception as error:  # a foreign package raises anything
-            fault = f"the command {point.name} ({point.value}) cannot be imported: {error}"
-            if point.name == chosen:
-                raise PackageError(f"{fault}. Repair or uninstall its package.") from error
-            print(f"note: {fault}", file=sys.stderr)
+        others = list(plugins("commands", built_in=_MODULES))
+    for each in others:
+        if not each.fault:
+            commands[each.name] = each.loaded
+        elif each.name == chosen:
+            raise PackageError(each.refusal)
+        else:
+            print(f"note: {each.refusal}", file=sys.stderr)
     return commands
 
 

@@ -58,12 +58,11 @@ class Track(TrackOptions):
 
 
 def follow(run: Session) -> None:
-    """Until the source ends, the time is up, the arms have ended, or Ctrl-C."""
-    from tumortrack.core.halt import Halt
+    """Until the source ends, the time is up, the controller has ended, or Ctrl-C."""
 
     def stop() -> None:
-        if run.arms is not None:
-            run.arms.operation.abort(Halt("interrupted"))
+        if run.controller is not None:
+            run.controller.stop("interrupted")
         run.loop.stop()
 
     say("warming up ...")
@@ -84,11 +83,6 @@ def say_opened(sinks: list[SinkWorker]) -> None:
     for sink in sinks:
         for note in sink.notes:
             say(f"sink {sink.name}: {note}")
-
-
-def stage_words(state: str, ur: bool) -> str:
-    """A stage for the screen. ``ur``: there are sinks of real arms, which may not be home yet."""
-    return state.replace("home", "the way back", 1) if ur else state
 
 
 def say_failures(sinks: list[SinkWorker], known: dict[str, str]) -> None:
@@ -136,12 +130,9 @@ class _Screen:
         state = result.describe()
         finding, used = result.finding, result.estimate and result.estimate.report.cameras
         kind: list[object] = [result.quality, finding.same_as if finding else result.reason, used]
-        if (cell := result.workcell) is not None:
-            arms = self._run.arms
-            stage = stage_words(cell.state, arms is not None and arms.ur)
-            state += f"; arms: {stage}" + (f" ({cell.halted})" if cell.halted else "")
-            state += f"; {cell.left}" if cell.left else ""
-            kind += [cell.state, cell.halt and cell.halt.same_as]
+        if (control := result.control) is not None:
+            state += f"; {control.line}"
+            kind.append(control.kind)
         now = time.monotonic()
         if kind != self._state and now - self._changed >= _SAY_S:
             self._state, self._changed = kind, now

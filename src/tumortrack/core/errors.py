@@ -78,12 +78,6 @@ class NoPlan(TumortrackError):
     exit_code = 3
 
 
-class Aborted(TumortrackError):
-    """Arms were stopped for good before they had finished."""
-
-    exit_code = 3
-
-
 class StorageError(TumortrackError):
     """The disk refused a write; what was there before is intact."""
 

@@ -23,18 +23,24 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate, TumortrackError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.evidence import Evidence
-from tumortrack.core.halt import Halt
 from tumortrack.core.report import Finding
 from tumortrack.core.types import DepthError, DepthFrame, Intrinsics
 from tumortrack.io.depth_files import DepthCorrection
-from tumortrack.live import values as live
 from tumortrack.live.cameras import Cameras
 from tumortrack.live.meter import RunStatistics
-from tumortrack.live.values import CameraView, Observation, SourceLost, TrackingResult
+from tumortrack.live.values import (
+    CameraView,
+    Controller,
+    Observation,
+    SinkContext,
+    SourceLost,
+    TrackingResult,
+)
 from tumortrack.live.views import OrganInView, Scan, ViewsLocator, camera_words, timed
 from tumortrack.live.workers import OPENING_S, SinkWorker, SourceWorker
 from tumortrack.segmentation import Hints, RegionConfig, organ_points
-from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
+from tumortrack.tracking.follower import Follower, FollowerConfig
+from tumortrack.tracking.tracker import Tracker
 
 _QUIET = 0.8  # of stale_s: silence is reported while the last result is still valid
 _AHEAD_S = 0.1  # allowed difference of two clocks
@@ -89,11 +95,10 @@ class Loop:
     def __init__(
         self,
         tracker: Tracker,
-        context: live.SinkContext,
+        context: SinkContext,
         config: LoopConfig,
-        arms: live.ArmsController | None = None,
     ) -> None:
-        self._config, self._context, self._arms = config, context, arms
+        self._config, self._context, self._controller = config, context, context.controller
         self._follower = Follower(tracker, config.follower)
         seed = config.follower.seed
         self.views = ViewsLocator(self._follower, context, config.region, config.frozen_s, seed)
@@ -140,11 +145,11 @@ class Loop:
         try:
             for result in self._results(source):
                 on_result(self._publish(result, sink_workers))
-                if self._arms is not None and self._arms.ended:
+                if self._controller is not None and self._controller.ended:
                     return
         finally:
-            if self._arms is not None and not self._arms.ended:
-                self._arms.abort(Halt("ended"))
+            if self._controller is not None and not self._controller.ended:
+                self._controller.stop("ended")
                 self._publish(self._without_frame("tracking has ended"), sink_workers)
 
     def _results(self, source_worker: Cameras) -> Iterator[TrackingResult]:
@@ -218,9 +223,9 @@ class Loop:
             organ = found[0][1]
             with timed(seconds, "locate"):
                 known: tuple[Evidence, ...] = ()
-                if self._arms is not None:
+                if self._controller is not None:
                     place, stamp_ns = found[0][0].published_from_camera, found[0][0].seen.stamp_ns
-                    known = self._arms.evidence(np.linalg.inv(place), stamp_ns)
+                    known = self._controller.evidence(np.linalg.inv(place), stamp_ns)
                 estimate = self.views.locate(found, known)
             seconds |= {f"locate.{k}": v for k, v in estimate.report.timings.items()}
             if several:
@@ -320,21 +325,21 @@ class Loop:
         return replace(view, seen=replace(view.seen, content=content))
 
     def _publish(self, result: TrackingResult, sink_workers: list[SinkWorker]) -> TrackingResult:
-        if self._arms is not None:
-            result = self._act(self._arms, result)
+        if self._controller is not None:
+            result = self._act(self._controller, result)
         for sink_worker in sink_workers:
             sink_worker.put(result)
         self.statistics.add(result)
         return result
 
-    def _act(self, arms: live.ArmsController, result: TrackingResult) -> TrackingResult:
+    def _act(self, controller: Controller, result: TrackingResult) -> TrackingResult:
         try:
             if self._context.controls.aborted.is_set():
-                arms.abort(Halt("aborted"))
-            return arms.act(result)
-        except Exception as error:  # a defect there stops the arms, but not tracking
+                controller.stop("aborted")
+            return controller.act(result)
+        except Exception as error:  # a defect there stops the controller, but not tracking
             self.statistics.add_defect(error)
-            arms.abort(Halt("defect", {"words": f"{type(error).__name__}: {error}"}))
+            controller.stop("defect", f"{type(error).__name__}: {error}")
             return result
 
 

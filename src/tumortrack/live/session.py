@@ -7,7 +7,6 @@ import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from tumortrack.live.loop import Loop, LoopConfig, summary
 from tumortrack.live.spec import SINKS, TOOLS
 from tumortrack.live.tools import ToolConfig, Tools
 from tumortrack.live.values import (
-    ArmsController,
+    Controller,
     SinkConfig,
     SinkContext,
     SourceConfig,
@@ -30,25 +29,14 @@ from tumortrack.live.values import (
 )
 from tumortrack.live.workers import SinkWorker, SourceWorker
 from tumortrack.registration.base_model import Model
+from tumortrack.tracking.follower import FollowerConfig
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.options import TrackOptions, model_folder
-from tumortrack.tracking.tracker import FollowerConfig, Tracker
+from tumortrack.tracking.tracker import Tracker
 
 _SETTLED_S = 60.0  # by then all buffers have their size: memory that grows on is a leak
 _FIRST_S = 5.0  # an open camera's first frame may take so long, however short a run is wanted
 _STORE_S = 10.0  # between two writings of the report: kill -9 loses no more
-
-
-@dataclass(frozen=True, eq=False)
-class Arms:
-    """Arms that act on what is tracked. ``setup``: what they were checked with; ``about`` them, for
-    the report; ``tip_mm``: as of ``SinkContext``; ``ur``: sinks are real arms, connected or not."""
-
-    operation: ArmsController
-    setup: CameraSetup
-    about: dict[str, Any]
-    tip_mm: Any
-    ur: bool
 
 
 class Session:
@@ -58,8 +46,11 @@ class Session:
     Args:
         model: a tracker, or the folder of a case or model.
         sinks: as written on the command line, their configurations, or sinks.
+        controller: acts on what is tracked.
+        setup: that the controller was checked with; None: as ``source`` and ``options`` say.
 
     Attributes:
+        about: what the report says of the run beforehand; more may be added until it is opened.
         unwritten: why the report could not be written last; empty: it could.
         started: a frame came.
 
@@ -76,10 +67,10 @@ class Session:
         source: str | SourceConfig,
         sinks: Sequence[Any],
         options: TrackOptions,
-        arms: Arms | None = None,
+        controller: Controller | None = None,
+        setup: CameraSetup | None = None,
     ) -> None:
-        # What executes was checked with its own.
-        self.setup = setup = _cameras(source, options) if arms is None else arms.setup
+        self.setup = setup = _cameras(source, options) if setup is None else setup
         self._named, self._tools = named_sinks(sinks), named_tools(options.tool)
         digest = {}
         if isinstance(model, Tracker):
@@ -98,19 +89,18 @@ class Session:
         if setup.still and tracker.anatomy_ct is None:
             raise InputError("--views needs a model that knows a motion: give the case itself.")
         self._config = config = _loop_config(options, loaded)
-        self.arms = arms
+        self.controller = controller
         self._context = SinkContext(
             loaded.parts,
             setup.published,
             tracker.anatomy_ct,
-            arms=arms is not None,
+            controller=controller,
             patient=loaded.patient,
             cameras=setup.still,
-            tip_mm=None if arms is None else arms.tip_mm,
             corrected=config.correction != DepthCorrection(),
             tools=tuple(self._tools),
         )
-        self.loop = Loop(tracker, self._context, config, None if arms is None else arms.operation)
+        self.loop = Loop(tracker, self._context, config)
         self.report, self.unwritten, self.started = options.report, "", False
         frames = setup.published
         placed = None if frames.moves else frames.published_from_camera.tolist()
@@ -127,7 +117,6 @@ class Session:
             "moving": options.moving,
             "tool": list(options.tool),
             "published_from_cameras": [place.tolist() for place in setup.still],
-            **({} if arms is None else arms.about),
         }
 
     @contextmanager
@@ -162,7 +151,7 @@ class Session:
             store.remove(self.report)
 
     def run(self, on_result: Callable[[TrackingResult], None]) -> None:
-        """Until the source ends, the time is up, the arms have ended, or ``loop.stop``. Raises as
+        """Until the source ends, the time is up, the controller ends, or ``loop.stop``. Raises as
         ``Loop.run``."""
 
         def show(result: TrackingResult) -> None:
@@ -192,7 +181,7 @@ class Session:
             "frame_notes": frames.notes,
             "tools": self.loop.views.tools.summary(),
             **self.summary(),
-            **({} if self.arms is None else {"resection": self.arms.operation.summary()}),
+            **({} if self.controller is None else self.controller.summary()),
         }
         try:
             store.write_json(self.report, content)

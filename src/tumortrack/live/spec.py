@@ -2,37 +2,29 @@
 
 A kind is a configuration class that an installed package, such as tumortrack-devices, offers by an
 entry point in ``tumortrack.sources``, ``.sinks``, ``.poses`` or ``.tools``, named as the class's
-``tag``. Only the requested kind is imported, so a broken package affects no other.
+``tag`` (``core/plugins.py``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from pkgutil import resolve_name
+from typing import Any, Generic, TypeVar
 
 import msgspec
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.packages import to_install
+from tumortrack.core.plugins import Plugin, names, plugins
 from tumortrack.core.report import Point
 from tumortrack.live.poses import PosesConfig
 from tumortrack.live.tools import ToolConfig
 from tumortrack.live.values import SinkConfig, SourceConfig
 
 C = TypeVar("C", bound=Config)
-
-
-class Extension(NamedTuple):
-    """A kind of another package; ``fault``: why it cannot be used, empty if it can."""
-
-    what: str
-    kind: str
-    package: str
-    fault: str
 
 
 @dataclass(frozen=True)
@@ -55,53 +47,20 @@ class Registry(Generic[C]):
         where = f"{self.what} {text!r}"
         return _filled(self.config(kind, where), target, options, where)
 
-    def extensions(self) -> Iterator[Extension]:
-        """The kinds of other packages; each class is imported."""
-        entries = self._entry_points()
-        for entry in entries:
-            fault = ""
-            try:
-                self.config(entry.name, f"{self.what} {entry.name!r}", entries)
-                if entry.name in self.built_in:
-                    fault = f"{entry.name!r} is built in, and cannot be replaced"
-            except InputError as error:
-                fault = str(error)
-            yield Extension(self.what, entry.name, _package_of(entry), fault)
-
-    def config(self, kind: str, where: str, entries: Sequence[EntryPoint] | None = None) -> type[C]:
-        """The configuration class of a kind, among ``entries`` (None: all that are installed).
-        Raises InputError, which begins with ``where``."""
+    def config(self, kind: str, where: str) -> type[C]:
+        """The configuration class of a kind. Raises InputError, which begins with ``where``."""
         if kind in self.built_in:
-            return EntryPoint(kind, self.built_in[kind], self.group).load()
-        entries = self._entry_points() if entries is None else entries
-        matches = [entry for entry in entries if entry.name == kind]
-        if not matches and kind in self.packages:
+            return resolve_name(self.built_in[kind])
+        if (found := next(plugins(self.group, self.base, name=kind), None)) is not None:
+            if found.fault:
+                raise InputError(f"{where}: {found.refusal}")
+            return found.loaded
+        if kind in self.packages:
             raise InputError(
                 f"{where}: {kind!r} is not installed here: {to_install(self.packages[kind])}."
             )
-        if not matches:
-            allowed = sorted({*self.built_in, *self.packages, *(entry.name for entry in entries)})
-            raise InputError(f"{where}: there is no kind {kind!r}. Allowed: {', '.join(allowed)}.")
-        if len(matches) > 1:
-            packages = " and ".join(sorted(map(_package_of, matches)))
-            raise InputError(f"{where}: {packages} both offer {kind!r}. Uninstall one of them.")
-        cause: Exception | None = None
-        try:
-            config: type[C] = matches[0].load()
-            fault = f"offers {matches[0].value}, which is no {self.base.__name__} of tumortrack"
-            if isinstance(config, type) and issubclass(config, self.base):
-                if (tag := config.__struct_config__.tag) == kind:
-                    return config
-                fault = f"names its entry point {kind!r}, and its class {tag!r}: not the same"
-        except Exception as error:  # a foreign package raises anything
-            cause = error
-            fault = f"offers {kind!r}, but it cannot be imported ({type(error).__name__}: {error})"
-        raise InputError(
-            f"{where}: the package {_package_of(matches[0])} {fault}. Repair or uninstall it."
-        ) from cause
-
-    def _entry_points(self) -> list[EntryPoint]:
-        return sorted(entry_points(group=self.group), key=lambda entry: entry.name)
+        allowed = sorted({*self.built_in, *self.packages, *names(self.group)})
+        raise InputError(f"{where}: there is no kind {kind!r}. Allowed: {', '.join(allowed)}.")
 
 
 def _devices(*kinds: str, **others: str) -> dict[str, str]:
@@ -110,7 +69,7 @@ def _devices(*kinds: str, **others: str) -> dict[str, str]:
 
 SOURCES = Registry[SourceConfig](
     "source",
-    "tumortrack.sources",
+    "sources",
     SourceConfig,
     _devices(
         *("virtual", "recording", "ros2"),
@@ -121,7 +80,7 @@ SOURCES = Registry[SourceConfig](
 )
 SINKS = Registry[SinkConfig](
     "sink",
-    "tumortrack.sinks",
+    "sinks",
     SinkConfig,
     _devices(
         *("viewer", "recording", "ros2", "moveit", "openigtlink"), ur="tumortrack-resection[ur]"
@@ -129,23 +88,20 @@ SINKS = Registry[SinkConfig](
 )
 POSES = Registry[PosesConfig](
     "camera's pose",
-    "tumortrack.poses",
+    "poses",
     PosesConfig,
     _devices("ros2", "ur"),
     {"file": "tumortrack.live.poses:PosesFileConfig"},
 )
 TOOLS = Registry[ToolConfig](
-    "tool", "tumortrack.tools", ToolConfig, _devices("file", "ros2", "openigtlink", "ur")
+    "tool", "tools", ToolConfig, _devices("file", "ros2", "openigtlink", "ur")
 )
 
 
-def extensions() -> list[Extension]:
+def extensions() -> Iterator[Plugin]:
     """All kinds that installed packages add."""
-    return [each for kinds in (SOURCES, SINKS, POSES, TOOLS) for each in kinds.extensions()]
-
-
-def _package_of(entry: EntryPoint) -> str:
-    return entry.dist.name if entry.dist is not None else entry.value
+    for kinds in (SOURCES, SINKS, POSES, TOOLS):
+        yield from plugins(kinds.group, kinds.base, kinds.built_in)
 
 
 def _filled(config: type[C], target: str, options: str, where: str) -> C:

@@ -7,11 +7,11 @@ import math
 import threading
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt8
@@ -22,7 +22,6 @@ from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate
 from tumortrack.core.evidence import Evidence
 from tumortrack.core.geometry import Affine, rigid, transform_points
-from tumortrack.core.halt import Halt
 from tumortrack.core.patient import NOBODY, Patient
 from tumortrack.core.report import Finding
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
@@ -140,20 +139,21 @@ class TransformedEstimate:
 
 @dataclass(frozen=True, eq=False)
 class RigidShape:
-    """A surface that moves rigidly: a link of an arm, a table, a planned piece. ``name``: unique
-    within a workcell, with slashes between levels. Sinks need to send the surface again only when
-    ``mesh`` is another object."""
+    """A surface that moves rigidly. ``name``: unique among a controller's shapes, with slashes
+    between levels. ``still``: it neither moves nor deforms. Sinks need to send the surface again
+    only when ``mesh`` is another object."""
 
     name: str
     mesh: Mesh  # in its own frame, mm
     published_from_shape: Float64[np.ndarray, "4 4"]
     colour: tuple[int, int, int]  # 0..255
     opacity: float = 1.0
+    still: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Polyline:
-    """A line through points of the published frame, mm: a cut, an instrument's path."""
+    """A line through points of the published frame, mm."""
 
     name: str
     points_mm: Float64[np.ndarray, "n 3"]
@@ -161,46 +161,24 @@ class Polyline:
     width_mm: float = 1.0
 
 
-PLANNED = "planned/"  # begins the names of such shapes
-
-
 @dataclass(frozen=True, eq=False)
-class Workcell:
-    """What the arms are doing, and what is shown with them; published frame, mm.
+class ControlState:
+    """What a controller does, and what is shown with it; published frame, mm.
 
-    ``state``: of the procedure: approach, grasp, hold, sweep 1, ... ``halt``: why the arms have
-    stopped early; None: they have not. ``joints_rad``: angle by name of the joint. ``left_mm``:
-    what the present errors leave of the instrument's distance to the tumor ``left_to``, which is
-    the least safe; None: unknown. ``cutting``: the instrument is on a cut.
+    ``state``: its stage, in a word or two. ``stopped``: why it has stopped early, in words; empty:
+    it has not. ``note``: what else a person must know, in words. ``line``: all of this, for a
+    terminal. ``kind``: equal where nothing but numbers differs. ``joints_rad``: angle by name of
+    the joint.
     """
 
     state: str
-    halt: Halt | None = None
+    stopped: str = ""
+    note: str = ""
+    line: str = ""
+    kind: object = None
     joints_rad: Mapping[str, float] = field(default_factory=dict)
     shapes: tuple[RigidShape, ...] = ()
     lines: tuple[Polyline, ...] = ()
-    left_mm: float | None = None
-    left_to: str = ""
-    cutting: bool = False
-
-    @property
-    def halted(self) -> str:
-        """Why the arms have stopped early, in words; empty: they have not."""
-        return "" if self.halt is None else self.halt.words
-
-    @property
-    def left(self) -> str:
-        """``left_mm`` in words; empty: unknown."""
-        if self.left_mm is None:
-            return ""
-        if self.left_mm < 0:
-            return f"errors exceed the distance to {self.left_to} by {-self.left_mm:.1f} mm"
-        return f"{self.left_mm:.1f} mm or more are left of the distance to each tumor"
-
-    @property
-    def planned_shapes(self) -> tuple[RigidShape, ...]:
-        """Organ and tumors as planned on: these neither move nor deform."""
-        return tuple(shape for shape in self.shapes if shape.name.startswith(PLANNED))
 
     @property
     def drawn_lines(self) -> list[Polyline]:
@@ -234,12 +212,12 @@ class TrackingResult:
         seconds: duration of each stage.
         latency_ms: from the stamp to the handover to the sinks (without this machine's clock: from
             the arrival; from a lossless source: from the reading); None without a frame.
-        workcell: what the arms do with it; None without arms.
+        control: what the controller does with it; None without one.
         dropped: frames so far that newer ones replaced.
         views: of several cameras, what each saw.
         cameras: in words, which cameras the estimate is from and why not from the others; of a
             scan, what each look added; else empty.
-        playback: a stored plan is shown: nothing is tracked, and there never is an estimate.
+        playback: what was stored is shown: nothing is tracked, and there never is an estimate.
         finding: what ``reason`` or ``warning`` says, by its kind.
         evidence: what became known with this frame, camera frame.
     """
@@ -255,7 +233,7 @@ class TrackingResult:
     published_frame: PublishedFrame = field(default_factory=PublishedFrame)
     seconds: Mapping[str, float] = field(default_factory=dict)
     latency_ms: float | None = None
-    workcell: Workcell | None = None
+    control: ControlState | None = None
     dropped: int = 0
     views: tuple[CameraView, ...] = ()
     cameras: str = ""
@@ -331,32 +309,37 @@ class TrackingResult:
         return f"{self.quality}: {self.warning}{by}"
 
 
+# Why a controller is stopped: by the user's ``Controls``, by a defect, as tracking has ended, or as
+# the program is interrupted
+StopReason = Literal["aborted", "defect", "ended", "interrupted"]
+
+
 @runtime_checkable
-class ArmsController(Protocol):
-    """Moves arms by the results. The loop calls it from its own thread only."""
+class Controller(Protocol):
+    """Moves something by the results. The loop calls it from its own thread only."""
 
     @property
     def ended(self) -> bool:
-        """The procedure is over; the loop ends too."""
+        """It is done; the loop ends too."""
 
     def act(self, result: TrackingResult) -> TrackingResult:
-        """The result with the present workcell, for the sinks. Called with every result, with and
+        """The result with its present state, for the sinks. Called with every result, with and
         without an estimate."""
 
     def evidence(self, camera_from_published: Affine, stamp_ns: int) -> tuple[Evidence, ...]:
-        """What the arms know of the organ's place in a frame; its camera's frame."""
+        """What it knows of the organ's place in a frame; its camera's frame."""
 
-    def abort(self, halt: Halt) -> None:
-        """Stop the arms for good."""
+    def stop(self, why: StopReason, words: str = "") -> None:
+        """Stop for good. ``words``: of a defect."""
 
     def summary(self) -> dict[str, Any]:
-        """What they did, for the run's report."""
+        """What it did: further keys of the run's report."""
 
 
 @dataclass(eq=False)
 class Controls:
     """What the user asks of the running loop; from any thread. ``picked_mm``: a point on the organ
-    (published frame): track the piece that it is on. ``aborted``: the arms stop for good.
+    (published frame): track the piece that it is on. ``aborted``: the controller stops for good.
     ``clicks``: colours at clicks in pictures; ``taught``: the classifier learned from them, if they
     can be separated; ``colour``: its state in words. ``touched``: names of tools of which the user
     says that they touch now, or take, or let go.
@@ -405,19 +388,17 @@ class Controls:
 class SinkContext:
     """What a sink knows when it is opened. ``parts``: of the model, the organ first.
     ``anatomy_ct``: the organ in the CT (LPS, mm), if the model has it: estimates then have a
-    motion, and their meshes its triangles. ``arms``: results may have a workcell. ``patient``: of
-    the model. ``cameras``: poses of several fixed cameras, published frame. ``tip_mm``: from an
-    arm's name (cutter, holder) and its six joints to the tip of its tool, published frame.
+    motion, and their meshes its triangles. ``controller``: acts on results, which then have its
+    state. ``patient``: of the model. ``cameras``: poses of several fixed cameras, published frame.
     ``corrected``: depths are corrected before sinks see them. ``tools``: names of what touches."""
 
     parts: tuple[str, ...]
     published_frame: PublishedFrame
     anatomy_ct: Anatomy | None = None
     controls: Controls = field(default_factory=Controls)
-    arms: bool = False
+    controller: Controller | None = None
     patient: Patient = NOBODY
     cameras: tuple[Float64[np.ndarray, "4 4"], ...] = ()
-    tip_mm: Callable[[str, Float64[np.ndarray, " 6"]], Float64[np.ndarray, " 3"]] | None = None
     corrected: bool = False
     tools: tuple[str, ...] = ()
 

@@ -24,7 +24,8 @@ from tumortrack.segmentation import Hints, RegionConfig, organ_points
 from tumortrack.segmentation.measured_noise import DepthNoise
 from tumortrack.segmentation.tissue import TissueClassifier
 from tumortrack.segmentation.watch import TableWatch
-from tumortrack.tracking.tracker import Follower, Tracker
+from tumortrack.tracking.follower import Follower
+from tumortrack.tracking.tracker import Tracker
 
 _NOISE_S = 1.0  # a camera's noise is measured so often: as long as a frame's other work takes
 _PICK_S = 3.0  # without the organ: a pick is forgotten

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -19,11 +18,11 @@ from tumortrack.core.errors import InputError, PackageError
 from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.evidence import Evidence
 from tumortrack.core.packages import to_install
+from tumortrack.core.plugins import plugins
 from tumortrack.core.types import Anatomy, Look
 from tumortrack.io.case import Case
 from tumortrack.registration.base_model import Model, ModelConfig
 
-GROUP = "tumortrack.methods"
 Preset = Callable[[Anatomy, Literal["limited", "full"]], Any]  # rotations -> a ``ModelConfig``
 
 
@@ -131,18 +130,13 @@ def method_of_folder(manifest: Mapping[str, Any]) -> Method:
 
 def _installed(what: str, belongs_to: Callable[[Method], bool]) -> Method:
     faults, methods = list[str](), list[str]()
-    for point in entry_points(group=GROUP):
-        try:
-            method: Method = point.load()
-        except PackageError as error:
-            faults.append(str(error))
-        except Exception as error:  # a foreign package raises anything
-            fault = f"the method {point.name} ({point.value}) cannot be imported: {error}"
-            faults.append(f"{fault}. Repair or uninstall its package.")
+    for each in plugins("methods"):
+        if each.fault:
+            faults.append(each.refusal)
+        elif belongs_to(each.loaded):
+            return each.loaded
         else:
-            if belongs_to(method):
-                return method
-            methods.append(point.name)
+            methods.append(each.name)
     if faults:
         raise PackageError(faults[0])
     if methods:

@@ -21,11 +21,11 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.organ import is_tumor, organ_name
 from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.live.values import (
+    ControlState,
     RigidShape,
     SinkContext,
     TrackingResult,
     TransformedEstimate,
-    Workcell,
 )
 from tumortrack_devices.beside import Beside
 from tumortrack_devices.display import MOST_SEEN, seen_points, thinned, wxyz_of
@@ -91,7 +91,7 @@ class ResultMessages:
         self._meshes_rate, self._markers_rate, self._points_rate = Rate(hz), Rate(hz), Rate(hz)
         self._beside = Beside()
         self._spots_shown, self._shown = set[tuple[str, int]](), set[str]()
-        self._shown_state: tuple[str, bool, bool] | None = None
+        self._shown_state: tuple[object, ...] | None = None
         self._planned: tuple[Mesh, ...] | None = None  # sent last
 
     def of(self, result: TrackingResult) -> list[Outgoing]:
@@ -116,16 +116,16 @@ class ResultMessages:
             metres = np.full(3, np.nan) if center_mm is None else center_mm / MM_PER_M
             send(f"{name}/center", PLACE, header=header, point=xyz(metres))
         send("/tf", TRANSFORMS, transforms=self._frames(result))
-        arms = [_arms_status(result)] if self._context.arms else []
+        arms = [] if self._context.controller is None else [_arms_status(result)]
         status = [self._estimate_status(result), *arms]
         send("diagnostics", DIAGNOSTICS, header=header, status=status)
         levels = [entry["level"] for entry in status]
         if self._status_rate.due() or levels != self._levels:
             send("/diagnostics", DIAGNOSTICS, header=header, status=status)
         self._levels = levels
-        if not self._context.arms:
+        if self._context.controller is None:
             return out
-        joints = {} if result.workcell is None else result.workcell.joints_rad
+        joints = {} if result.control is None else result.control.joints_rad
         angles = np.array(list(joints.values()), np.float64)
         send("joint_states", JOINTS, header=header, name=list(joints), position=angles)
         if (markers := self._workcell(result)) is not None:
@@ -167,7 +167,7 @@ class ResultMessages:
                 markers.append(_triangles(name, mesh, colours.structure_colour(number), 1.0))
         if estimate is not None:
             markers += self._spots()
-        if estimate is not None or result.workcell is None:  # else it is in the workcell's text
+        if estimate is not None or result.control is None:  # else it is in the workcell's text
             markers.append(_quality_text(result))
         return markers
 
@@ -191,27 +191,29 @@ class ResultMessages:
     def _workcell(self, result: TrackingResult) -> list[dict[str, Any]] | None:
         """All of its markers or, if they are not due, None: a slow receiver keeps only the newest
         message, so each must be complete."""
-        cell = result.workcell
-        if cell is None:
+        control = result.control
+        if control is None:
             self._shown, self._shown_state = set(), None
             return [{"action": _DELETE_ALL}]
-        shapes = [shape for shape in cell.shapes if shape not in cell.planned_shapes]
-        names = {_STATE, *(s.name for s in shapes), *(line.name for line in cell.drawn_lines)}
+        shapes = [shape for shape in control.shapes if not shape.still]
+        names = {_STATE, *(s.name for s in shapes), *(line.name for line in control.drawn_lines)}
         gone, self._shown = self._shown - names, names
-        state = cell.state, bool(cell.halted), cell.cutting  # the reason changes with each frame
+        # Not the reason, which changes with each frame
+        state = control.state, bool(control.stopped), [shape.colour for shape in shapes]
         changed, self._shown_state = gone or state != self._shown_state, state
         if not self._markers_rate.due() and not changed:
             return None
         markers: list[dict[str, Any]] = [{"ns": name, "action": _DELETE} for name in sorted(gone)]
         markers += _shape_markers(shapes)
-        for line in cell.drawn_lines:
+        for line in control.drawn_lines:
             scale, points = {"x": line.width_mm / MM_PER_M}, PointBlock(line.points_mm / MM_PER_M)
             markers.append(_marker(line.name, _LINE, line.colour, scale=scale, points=points))
-        return [*markers, _state_text(result, cell)]
+        return [*markers, _state_text(result, control)]
 
     def _as_planned(self, result: TrackingResult) -> list[dict[str, Any]] | None:
         """What neither moves nor deforms, two thirds of all triangles: only when it changes."""
-        shapes = () if result.workcell is None else result.workcell.planned_shapes
+        every = () if result.control is None else result.control.shapes
+        shapes = [shape for shape in every if shape.still]
         meshes = tuple(shape.mesh for shape in shapes)
         if self._planned is not None and list(map(id, meshes)) == list(map(id, self._planned)):
             return None
@@ -249,12 +251,12 @@ class ResultMessages:
 
 
 def _arms_status(result: TrackingResult) -> dict[str, Any]:
-    """OK with the state, WARN where the arms are halted, STALE without a workcell."""
-    cell = result.workcell
-    if cell is None:
+    """OK with the state, WARN where the arms are halted, STALE where nothing is known of them."""
+    control = result.control
+    if control is None:
         return _status(_STALE, "arms", "nothing is known of the arms", result, {})
-    values = {"state": cell.state, "halted": cell.halted}
-    return _status(_WARN if cell.halted else _OK, "arms", _describe(cell), result, values)
+    values = {"state": control.state, "halted": control.stopped}
+    return _status(_WARN if control.stopped else _OK, "arms", _describe(control), result, values)
 
 
 def _status(
@@ -293,17 +295,17 @@ def _quality_text(result: TrackingResult) -> dict[str, Any]:
     return _marker("quality", _TEXT, colour, position_mm, text=text, scale=scale)
 
 
-def _state_text(result: TrackingResult, cell: Workcell) -> dict[str, Any]:
+def _state_text(result: TrackingResult, control: ControlState) -> dict[str, Any]:
     """Its top is as high as the highest shape (where arms are, z is up), inside a view of all."""
-    text = fill(_describe(cell), _STATE_COLUMNS)
+    text = fill(_describe(control), _STATE_COLUMNS)
     if result.estimate is None:
         text += f"\n{fill(result.describe(), _STATE_COLUMNS)}"
-    extents = [line.points_mm for line in cell.drawn_lines]
-    extents += [] if cell.box_mm is None else [cell.box_mm]
+    extents = [line.points_mm for line in control.drawn_lines]
+    extents += [] if control.box_mm is None else [control.box_mm]
     corners = np.concatenate(extents) if extents else np.zeros((1, 3))
     position_mm = (corners.min(0) + corners.max(0)) / 2
     position_mm[2] = corners[:, 2].max() - _half_height_mm(text, _STATE_HEIGHT_M)
-    colour, scale = colours.NONE if cell.halted else _STATE_COLOUR, {"z": _STATE_HEIGHT_M}
+    colour, scale = colours.NONE if control.stopped else _STATE_COLOUR, {"z": _STATE_HEIGHT_M}
     return _marker(_STATE, _TEXT, colour, position_mm, text=text, scale=scale)
 
 
@@ -312,8 +314,10 @@ def _half_height_mm(text: str, height_m: float) -> float:
     return MM_PER_M * (height_m + _GAP_M) / 2 * text.count("\n")
 
 
-def _describe(cell: Workcell) -> str:
-    return f"{cell.state}, halted: {cell.halted}" if cell.halted else cell.state
+def _describe(control: ControlState) -> str:
+    if control.stopped:
+        return f"{control.state}, halted: {control.stopped}"
+    return control.state
 
 
 def _shape_markers(shapes: Sequence[RigidShape]) -> list[dict[str, Any]]:

@@ -140,21 +140,21 @@ class OpenIgtLinkSink:
         if result.latency_ms is not None:
             more["latency_ms"] = f"{result.latency_ms:.1f}"
         yield "STATUS", STATUS_DEVICE, igtl.pack_status(code, name, text), more
-        cell = result.workcell
-        if not self._context.arms:
+        control = result.control
+        if self._context.controller is None:
             return
         status, more = (igtl.NOT_PRESENT, "unknown", "nothing is known of the arms"), {}
-        if cell is not None:
-            code = igtl.NOT_READY if cell.halted else igtl.OK
-            status, more = (code, cell.state, cell.halted), {"state": cell.state}
+        if control is not None:
+            code = igtl.NOT_READY if control.stopped else igtl.OK
+            status, more = (code, control.state, control.stopped), {"state": control.state}
         yield "STATUS", ARMS_DEVICE, igtl.pack_status(*status), more
 
     def _transforms(self, result: TrackingResult) -> Iterator[_Content]:
         poses = {name: result.part_pose(name) for name in self._context.parts[1:]}
         if self._context.anatomy_ct is not None:
             poses[CT] = result.published_from_ct
-        cell = result.workcell if self._context.arms else None
-        shapes = () if cell is None else cell.shapes
+        control = None if self._context.controller is None else result.control
+        shapes = () if control is None else control.shapes
         tips = {s.name: s.published_from_shape for s in shapes if s.name.endswith(_TIP)}
         for name, pose in (poses | tips).items():
             if pose is not None:

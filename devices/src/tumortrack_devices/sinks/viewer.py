@@ -104,7 +104,7 @@ class ViewerSink:
         self.server.scene.set_background_image(np.full((4, 4, 3), colours.BACKGROUND, np.uint8))
         self._scene = ViewerScene(self.server, context, config.margin_mm)
         slices = "" if self._ct is None else self._ct.name
-        options = slices, context.arms, str(context.patient), context.tools
+        options = slices, context.controller is not None, str(context.patient), context.tools
         self.panel = Panel(self.server, context.parts, *options)
         self._connect()
         self._say("waiting")
@@ -134,7 +134,7 @@ class ViewerSink:
                 if tool and event.client is not None:  # else set by the program
                     self._context.controls.touched.append(tool)
 
-        if self._context.arms:
+        if self._context.controller is not None:
             panel.abort.on_click(lambda _: self._abort())
 
             @panel.views.on_click
@@ -190,9 +190,9 @@ class ViewerSink:
         if state != "good":  # a page gets 128 messages at once: a warning comes with the first
             self._say(state)
         try:
-            self._scene.show_cell(result.workcell)
+            self._scene.show_control(result.control)
         except Exception as error:
-            self._scene.show_cell(None)
+            self._scene.show_control(None)
             self._fault = error  # raised when the estimate has been shown
         try:
             self._scene.observe(result)
@@ -224,7 +224,8 @@ class ViewerSink:
         if result is not None:
             since_s = self._came_s if state == "stale" else self._drawn_s
             age_s = time.monotonic() - since_s + (result.latency_ms or 0.0) / 1000
-        about = age_s, self._counter, self._context.arms, self._context.parts
+        arms = self._context.controller is not None
+        about = age_s, self._counter, arms, self._context.parts
         self.panel.stage.content = StatusPanel(state, result, *about).stage()
         finding = None if result is None else result.finding
         contradicted = finding is not None and finding.kind in ("evidence", "disputed")
@@ -240,7 +241,7 @@ class ViewerSink:
                     if stale and self._shown is not None:
                         self._hide()
                     if stale:
-                        self._scene.show_cell(None)
+                        self._scene.show_control(None)
                     self._say("stale" if stale else self._state)
                 self._renew_slice()
             except Exception as error:  # the thread must go on
@@ -339,8 +340,10 @@ class ViewerSink:
 
 def _kind(result: TrackingResult) -> tuple[str, str, bool]:
     """What a page must show without delay."""
-    cell = result.workcell
-    return result.quality, "" if cell is None else cell.state, cell is None or bool(cell.halted)
+    control = result.control
+    if control is None:
+        return result.quality, "", True
+    return result.quality, control.state, bool(control.stopped)
 
 
 def _load_ct(case: str, context: SinkContext) -> CarriedCt:

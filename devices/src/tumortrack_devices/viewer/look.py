@@ -11,7 +11,7 @@ from jaxtyping import Float
 from tumortrack.core.geometry import Affine, unit
 from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import Mesh
-from tumortrack.live.values import Workcell
+from tumortrack.live.values import ControlState
 
 if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle, ViserServer
@@ -42,7 +42,7 @@ class Viewpoint:
         self._aimed = False
         self._eye_mm = pose[:3, 3]  # of the visitor who moved last
         self._organ_mm = pose[:3, 3] + _FIRST_LOOK_MM * pose[:3, 2]
-        self._cell: Workcell | None = None  # the latest
+        self._control: ControlState | None = None  # the latest
         server.scene.set_up_direction(-pose[:3, 1])
         first = server.initial_camera
         first.fov, first.near, first.far = _FOV_RADIANS, _NEAR_MM, _FAR_MM
@@ -62,16 +62,16 @@ class Viewpoint:
             return
         self._aimed, moved = True, not np.array_equal(pose, self._pose)
         self._pose, self._organ_mm = pose, pose[:3, 3] + depth_mm * pose[:3, 2]
-        if self._cell is None:  # else they look at the whole workcell
+        if self._control is None:  # else they look at the whole workcell
             self._begin_with("organ")
             for client in self._server.get_clients().values():
                 if moved:
                     self.turn(client, "organ")
                 client.camera.look_at = self._organ_mm
 
-    def show_cell(self, cell: Workcell) -> None:
+    def show_control(self, control: ControlState) -> None:
         """The present workcell; at the first one all visitors look at its tools."""
-        first, self._cell = self._cell is None, cell
+        first, self._control = self._control is None, control
         if first:
             self._begin_with("tools")
             for client in self._server.get_clients().values():
@@ -93,8 +93,8 @@ class Viewpoint:
 
     def _view(self, towards: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Position, target, up."""
-        box_mm = None if towards == "organ" or self._cell is None else self._cell.box_mm
-        lines = [] if self._cell is None else self._cell.drawn_lines
+        box_mm = None if towards == "organ" or self._control is None else self._control.box_mm
+        lines = [] if self._control is None else self._control.drawn_lines
         if towards == "tools" and lines:
             points_mm = np.concatenate([line.points_mm for line in lines])
             room_mm = np.array([[-_ROUND_CUTS_MM], [_ROUND_CUTS_MM]])

@@ -15,7 +15,7 @@ from tumortrack.core.colours import Colour, css, part_colour
 from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED
 from tumortrack.core.patient import NOBODY
 from tumortrack.core.report import FitReport
-from tumortrack.live.values import Controls, TrackingResult, Workcell
+from tumortrack.live.values import Controls, ControlState, TrackingResult
 from tumortrack.report.slices import ORIENTATIONS
 from tumortrack_devices.viewer.look import View
 from tumortrack_devices.viewer.scene import DisplayOptions
@@ -45,7 +45,7 @@ _SIGNS: dict[State, tuple[str, Colour]] = {
     "poor": ("▲", colours.POOR),
     "none": ("✕", colours.NONE),
     "stale": ("◆", colours.STALE),
-    "playback": ("►", colours.ARMS),
+    "playback": ("►", colours.CONTROL),
 }
 _EMPTY: tuple[State, ...] = ("waiting", "none", "stale")
 
@@ -88,32 +88,32 @@ class StatusPanel(NamedTuple):
         quality = _box(f"{shape} {self.state.upper()}", colour, self._number)
         if not self.arms:
             return quality
-        if (cell := self._cell) is None:
+        if (control := self._control) is None:
             return quality + _box("ARMS: nothing is known of them", colours.STALE)
-        text, colour = _arms_sign(cell)
-        return quality + _box(f"ARMS: {text}", colour, cell.halted or cell.left)
+        text, colour = _arms_sign(control)
+        return quality + _box(f"ARMS: {text}", colour, control.stopped or control.note)
 
     def _over_scene(self) -> str:
         """A banner with the reason, and one of the arms; the watch. Without an estimate the whole
         page is in its colour, unless arms go on: they are meant to, as in a playback."""
         shape, colour = _SIGNS[self.state]
-        cell, size, tint = self._cell, "quiet" if self.state == "good" else "plain", ""
-        if self.state in _EMPTY and (cell is None or cell.halted):
+        control, size, tint = self._control, "quiet" if self.state == "good" else "plain", ""
+        if self.state in _EMPTY and (control is None or control.stopped):
             style, size = f"background:{css(colour)}48;color:{css(colour)}", "loud"
             tint = f"<div class='tumortrack-tint' style='{style}'></div>"
         why = f"{self._number}: {self._reason()}".removeprefix(": ")
         banner = tint + _over("top", size, colour, f"{shape} {self.state.upper()}", why)
-        if self.arms and cell is not None:
-            text, colour = _arms_sign(cell)
-            banner += _over("bottom", "plain", colour, text, cell.halted)
+        if self.arms and control is not None:
+            text, colour = _arms_sign(control)
+            banner += _over("bottom", "plain", colour, text, control.stopped)
         return banner + _SILENCE
 
     @property
-    def _cell(self) -> Workcell | None:
+    def _control(self) -> ControlState | None:
         """What the arms do, if that is current."""
         if self.result is None or self.state in ("waiting", "stale"):
             return None
-        return self.result.workcell
+        return self.result.control
 
     @property
     def _number(self) -> str:
@@ -171,8 +171,10 @@ class StatusPanel(NamedTuple):
         return f"<table><tr><th>{'</th><th>'.join(heads)}</th></tr>{''.join(rows)}</table>"
 
 
-def _arms_sign(cell: Workcell) -> tuple[str, Colour]:
-    return (f"{cell.state}: HALTED", colours.NONE) if cell.halted else (cell.state, colours.ARMS)
+def _arms_sign(control: ControlState) -> tuple[str, Colour]:
+    if control.stopped:
+        return f"{control.state}: HALTED", colours.NONE
+    return control.state, colours.CONTROL
 
 
 def _over(edge: str, size: str, colour: Colour, text: str, why: str) -> str:

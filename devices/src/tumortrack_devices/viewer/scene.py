@@ -1,4 +1,4 @@
-"""The viewer's 3-D scene: observation, estimate, workcell; published frame, mm.
+"""The viewer's 3-D scene: observation, estimate, controller; published frame, mm.
 
 Every node is made once and then changed in place, so that clients keep their buffers. Calls must
 not overlap: the sink holds a lock.
@@ -121,7 +121,7 @@ class ViewerScene:
         ]
         clear = np.zeros((2, 2, 4), np.uint8)
         self._slice = nodes.add_image("/estimate/slice", clear, 1, 1, format="png", **_FLAT)
-        self._cell = nodes.add_frame("/workcell", show_axes=False, visible=False)
+        self._control = nodes.add_frame("/workcell", show_axes=False, visible=False)
         # Look, place and node by name
         self._drawn: dict[str, tuple[dict[str, Any], np.ndarray, Any]] = {}
 
@@ -263,17 +263,17 @@ class ViewerScene:
         if point_mm is not None:
             self._picked.position = point_mm
 
-    def show_cell(self, cell: live.Workcell | None) -> None:
-        """Show the present workcell; None: nothing. A shape's surface is sent once, then only its
+    def show_control(self, control: live.ControlState | None) -> None:
+        """Show what a controller does; None: nothing. A shape's surface is sent once, then only its
         pose and its colour."""
-        self._cell.visible = cell is not None
-        if cell is None:
+        self._control.visible = control is not None
+        if control is None:
             return
-        shapes = {f"shape/{shape.name}": shape for shape in cell.shapes}
-        lines = {f"line/{line.name}": line for line in cell.drawn_lines}
+        shapes = {f"shape/{shape.name}": shape for shape in control.shapes}
+        lines = {f"line/{line.name}": line for line in control.drawn_lines}
         for name in self._drawn.keys() - shapes.keys() - lines.keys():
             self._drawn.pop(name)[2].remove()
-        poses = np.array([shape.published_from_shape for shape in cell.shapes]).reshape(-1, 4, 4)
+        poses = np.array([shape.published_from_shape for shape in control.shapes]).reshape(-1, 4, 4)
         turns = wxyz_of(poses[:, :3, :3]) if len(poses) else ()  # all at once: 5 times faster
         for (name, shape), wxyz in zip(shapes.items(), turns, strict=True):
             # None: opaque. With any opacity a mesh is drawn as translucent, and sorted.
@@ -290,7 +290,7 @@ class ViewerScene:
             add = partial(self._nodes.add_line_segments, points=segments)
             if (node := self._placed_node(name, line.points_mm, add, look)) is not None:
                 node.points = segments
-        self.look.show_cell(cell)
+        self.look.show_control(control)
 
     def _placed_node(
         self, name: str, place: np.ndarray, add: Callable[..., Any], look: dict[str, Any]

@@ -11,8 +11,10 @@ from tyro.conf import Positional
 from tumortrack.cli import track
 from tumortrack.cli.console import model_folder, options_of, progress_of, say, warn
 from tumortrack.core import store
-from tumortrack.core.errors import Aborted, InputError
+from tumortrack.core.errors import InputError
+from tumortrack_resection.halt import Aborted
 from tumortrack_resection.options import ResectOptions
+from tumortrack_resection.workcell import stage_words
 
 if TYPE_CHECKING:
     from tumortrack.live.values import TrackingResult
@@ -77,10 +79,10 @@ def _play(resection: ResectionSession) -> None:
     def show(result: TrackingResult) -> None:
         nonlocal shown
         track.say_failures(resection.sinks, errors)
-        cell = result.workcell
+        cell = result.control
         assert cell is not None
-        text = track.stage_words(cell.state, bool(resection.arms))
-        text += f": {cell.halted}" if cell.halted else ""
+        text = stage_words(cell.state, bool(resection.arms))
+        text += f": {cell.stopped}" if cell.stopped else ""
         if text != shown:
             say(shown := text)
 
@@ -108,7 +110,7 @@ def _film(resection: ResectionSession, path: Path) -> None:
 def _say_end(resection: ResectionSession) -> None:
     from tumortrack.live.session import check_closed
 
-    halt, state = resection.operation.halt, resection.operation.summary()["state"]
+    halt, state = resection.operation.halt, resection.operation.summary()["resection"]["state"]
     if state != "done":
         if halt is not None and halt.kind == "interrupted":
             raise KeyboardInterrupt

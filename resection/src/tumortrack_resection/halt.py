@@ -7,6 +7,7 @@ from typing import Literal
 
 import msgspec
 
+from tumortrack.core.errors import TumortrackError
 from tumortrack.core.report import Finding
 from tumortrack.core.tables import read_table
 
@@ -14,9 +15,15 @@ HaltKind = Literal[
     "no_estimate", "poor", "missing", "moved", "over_budget", "no_bound", "planning", "silent",
     "no_plan", "defect", "interrupted", "aborted", "ended", "stopped", "slipped", "restless",
 ]  # fmt: skip
-_SENTENCES = read_table("tumortrack.core", "halts.toml", dict[HaltKind, str])
+_SENTENCES = read_table("tumortrack_resection", "halts.toml", dict[HaltKind, str])
 CUT_NOTE = "cut: estimates are of the intact organ"
 _WITHOUT_NUMBERS = str.maketrans("", "", "0123456789.")
+
+
+class Aborted(TumortrackError):
+    """Arms were stopped for good before they had finished."""
+
+    exit_code = 3
 
 
 class Halt(msgspec.Struct, frozen=True):

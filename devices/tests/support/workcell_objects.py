@@ -11,15 +11,14 @@ from scipy.spatial.transform import Rotation
 
 from live_objects import STAMP_NS, small_setting, small_update
 from tumortrack.core.geometry import rigid
-from tumortrack.core.halt import Halt
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import (
+    ControlState,
     Polyline,
     PublishedFrame,
     RigidShape,
     SinkContext,
     TrackingResult,
-    Workcell,
 )
 
 UR = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -68,7 +67,7 @@ def workcell(
     halted: str = "",
     around_mm: tuple[float, float, float] = (14.0, 3.0, 40.0),
     radius_mm: float = 12.0,
-) -> Workcell:
+) -> ControlState:
     """``progress``: 0..1 along a circle round a place: by default the small objects' first
     tumor."""
     middle = np.array(around_mm)
@@ -88,17 +87,13 @@ def workcell(
         for k, joint in enumerate(UR)
     }
     lines = (Polyline("cut/1", circle, CUT, 2.0), Polyline("cut/2", circle - [0, 0, 8.0], CUT, 2.0))
-    return Workcell("sweep 1", stopped(halted) if halted else None, joints, shapes, lines)
-
-
-def stopped(words: str) -> Halt:
-    return Halt("stopped", {"words": words})
+    return ControlState("sweep 1", halted, joints_rad=joints, shapes=shapes, lines=lines)
 
 
 def working(sequence: int = 0, progress: float = 0.0, halted: str = "") -> TrackingResult:
     """An update with an estimate and a workcell."""
     update = small_update(sequence, STAMP_NS + sequence * 33_000_000, TABLE)
-    return replace(update, workcell=workcell(progress, halted))
+    return replace(update, control=workcell(progress, halted))
 
 
 def virtual(sequence: int = 0, progress: float = 0.0, halted: str = "") -> TrackingResult:
@@ -108,18 +103,35 @@ def virtual(sequence: int = 0, progress: float = 0.0, halted: str = "") -> Track
         STAMP_NS + sequence * 33_000_000,
         reason=REASON,
         published_frame=TABLE,
-        workcell=workcell(progress, halted),
+        control=workcell(progress, halted),
         playback=True,
     )
 
 
+class Arms:
+    """A controller that does nothing."""
+
+    ended = False
+
+    def act(self, result: TrackingResult) -> TrackingResult:
+        return result
+
+    def evidence(self, camera_from_published: np.ndarray, stamp_ns: int) -> tuple[()]:
+        return ()
+
+    def stop(self, why: str, words: str = "") -> None:
+        self.ended = True
+
+    def summary(self) -> dict[str, str]:
+        return {}
+
+    def tip_mm(self, arm: str, joints_rad: np.ndarray) -> np.ndarray:
+        """Of an arm that reaches a metre from its shoulder, and turns about that and its wrist."""
+        pan, wrist = joints_rad[0], joints_rad[0] + joints_rad[5]
+        return 900 * np.array([np.cos(pan), np.sin(pan), 0]) + 100 * np.array(
+            [np.cos(wrist), np.sin(wrist), 0]
+        )
+
+
 def with_arms() -> SinkContext:
-    return replace(small_setting(), published_frame=TABLE, arms=True, tip_mm=tip_mm)
-
-
-def tip_mm(arm: str, joints_rad: np.ndarray) -> np.ndarray:
-    """Of an arm that reaches a metre from its shoulder, and turns about that and its wrist."""
-    pan, wrist = joints_rad[0], joints_rad[0] + joints_rad[5]
-    return 900 * np.array([np.cos(pan), np.sin(pan), 0]) + 100 * np.array(
-        [np.cos(wrist), np.sin(wrist), 0]
-    )
+    return replace(small_setting(), published_frame=TABLE, controller=Arms())
