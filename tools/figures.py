@@ -7,16 +7,35 @@ python tools/figures.py --check   write nothing; exit status 1 also where a page
 
 from __future__ import annotations
 
+import re
 import sys
+from itertools import groupby
 from pathlib import Path
 
 import pandas as pd
 
 from tumortrack.assessment.fingerprint import fingerprint
-from tumortrack.core import store
+from tumortrack.core import renamed, store
 from tumortrack.core.errors import InputError
 from tumortrack.simulation.sensors import FIGURES, simulated
-from tumortrack_lab.document import MeasuredTable, rendered
+from tumortrack_lab.document import MeasuredTable, rendered, table_of
+
+_RENAMED = re.compile(r"(<!-- renamed -->\n).*?(<!-- /renamed -->)", re.DOTALL)
+_WHERE = {  # by section of renamed.toml
+    "modules": "Python: modules",
+    "names": "Python: names",
+    "commands": "commands",
+    "options": "options",
+    "choices": "options' values",
+    "keys": "keys of `--config` files, options of sinks",
+    "report": "report.json",
+    "plan": "plan.json",
+    "manifest": "a model's manifest.json",
+    "variables": "environment variables",
+    "entry_points": "groups of entry points",
+    "distributions": "distributions",
+    "targets": "`make`",
+}
 
 
 def sensors() -> str:
@@ -39,6 +58,19 @@ def sensors() -> str:
     return pd.DataFrame(rows, columns=columns).to_csv(index=False, lineterminator="\n")
 
 
+def changes() -> str:
+    """renamed.toml as Markdown: old names with one replacement share a row."""
+    rows = list[tuple[str, str, str]]()
+    for section, where in _WHERE.items():
+        for new, some in groupby(renamed.table()[section].items(), key=lambda item: item[1]):
+            rows.append((where, ", ".join(f"`{old}`" for old, _ in some), new))
+    return table_of(pd.DataFrame(rows, columns=["where", "gone", "use instead"]))
+
+
+def _filled(begin: str, end: str) -> str:
+    return f"{begin}\n{changes()}\n\n{end}"
+
+
 def differs(table: Path, check: bool) -> list[str]:
     """Whether the table of sensors is not what sensors.toml says; without ``check`` it is made."""
     if not check:
@@ -50,10 +82,11 @@ def differs(table: Path, check: bool) -> list[str]:
 def faults(root: Path, check: bool) -> list[str]:
     """Of the pages and tables of a checkout; ``check``: the pages are left as they are."""
     found, data = [], root / "docs/data"
-    for page in [root / "README.md", *sorted((root / "docs").rglob("*.md"))]:
+    above = [root / "README.md", *root.glob("CHANGELOG.md")]
+    for page in [*above, *sorted((root / "docs").rglob("*.md"))]:
         text, name = page.read_text(encoding="utf-8"), page.relative_to(root)
         try:
-            new = rendered(text, data)
+            new = _RENAMED.sub(lambda found: _filled(*found.groups()), rendered(text, data))
         except InputError as error:
             found.append(f"{name}: {error}")
             continue

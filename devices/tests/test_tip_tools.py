@@ -256,7 +256,7 @@ def test_a_tool_whose_poses_end_gives_nothing_and_says_so_once(tmp_path):
         ({"shaft_mm": 2.0}, BASE, "shaft_mm is 2"),
         ({"holds": True, "sweep": True}, BASE, "holds, sweep"),
         ({"part": "spleen"}, BASE, "spleen.*kidney, tumor_1"),
-        ({}, PublishedFrame(), "base.*camera.*--frame FILE"),
+        ({}, PublishedFrame(), "base.*camera.*frame=FILE"),
     ],
 )
 def test_what_cannot_be_is_one_clear_line(options, published, named, tmp_path):
@@ -444,7 +444,7 @@ def test_what_is_drawn_in_slicer_counts_once_it_rests(monkeypatch):
 
 def test_a_pointer_needs_the_calibration_that_drawings_do_not():
     config = OpenIgtLinkToolConfig(address="127.0.0.1:18944", name="Stylus")
-    with pytest.raises(InputError, match="--frame FILE"):
+    with pytest.raises(InputError, match="frame=FILE"):
         config.open(setting(PublishedFrame()), "pointer")
 
 

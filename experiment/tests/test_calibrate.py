@@ -35,7 +35,7 @@ from tumortrack_experiment.calibrate.virtual_board import (
 from tumortrack_experiment.record.read import IMAGE, STATE, WHOLE
 
 BOARD = Board(columns=7, rows=5, square_mm=24.0)
-OPTIONS = ["--squares", 7, 5, "--square-mm", 24]
+OPTIONS = ["--squares", 7, 5, "square_mm=", 24]
 LENS = Lens(
     width=424, height=240, fx=223.0, fy=224.0, cx=210.5, cy=121.0,
     distortion=(-0.03, 0.04, 0.0005, -0.0003, 0.0),
@@ -246,7 +246,7 @@ def faulty(poses, looks, fault):
         return poses[::-1], looks, "pictures' order"
     if fault == "size":
         larger = [rigid(look[:3, :3], look[:3, 3] * 1.1) for look in looks]
-        return poses, larger, r"0\.9\d* times as large as stated.*--square-mm"
+        return poses, larger, r"0\.9\d* times as large as stated.*square_mm="
     about = Rotation.from_rotvec(np.outer(rng.uniform(-0.6, 0.6, len(poses)), [0, 0, 1]))
     if fault == "small":
         about = Rotation.from_rotvec(rng.normal(0, 0.02, (len(poses), 3)))
@@ -280,7 +280,7 @@ def test_a_board_that_is_not_there_mirrored_or_another_one_is_told_apart():
     for picture_, board, said in (
         (np.full((240, 424), 90, np.uint8), BOARD, "no marker is seen"),
         (np.ascontiguousarray(picture[:, ::-1]), BOARD, "mirrored"),
-        (picture, Board(columns=6, rows=5, square_mm=24.0), "true --squares"),
+        (picture, Board(columns=6, rows=5, square_mm=24.0), "true squares="),
     ):
         with pytest.raises(InputError, match=said):
             find_boards([picture_], board)
@@ -311,7 +311,7 @@ def test_too_few_flat_or_wrongly_sized_boards_are_refused():
         PlaneErrors(np.arange(600), np.full(600, 0.1 * z), np.full(600, float(z)), n)
         for n, z in enumerate((80, 120, 160))
     ]
-    with pytest.raises(InputError, match=r"1\.10 times as far.*--square-mm"):
+    with pytest.raises(InputError, match=r"1\.10 times as far.*square_mm="):
         depth_report(far, LENS)
 
 

@@ -205,7 +205,7 @@ def test_clouds_in_other_formats_and_units_agree(work, seen, out):
     np.savez(work / "metres.npz", points=points / 1000)
     refused = ["locate", work / "model", work / "metres.npz", "--out", work / "no"]
     for crop in ([], ["--range", "110", "150"]):  # the crop alone would find nothing in range
-        assert "--unit m" in refusal(tumortrack(*refused, *crop))
+        assert 'unit="m"' in refusal(tumortrack(*refused, *crop))
     assert not (work / "no").exists()
     other = ["locate", work / "model", work / "metres.npz", "--out", work / "metres", "--unit", "m"]
     succeeded(tumortrack(*other, "--grid", 32))
@@ -266,7 +266,7 @@ def random_points(low: list[float], high: list[float]) -> np.ndarray:
     ("points", "error", "words"),
     [
         (np.full((300, 3), [0.0, 0, 140]), NoEstimate, "has 1 different points"),
-        (random_points([-0.05] * 3, [0.05] * 3) + [0, 0, 0.15], InputError, "--unit m"),
+        (random_points([-0.05] * 3, [0.05] * 3) + [0, 0, 0.15], InputError, 'unit="m"'),
         (random_points([-100, -100, 149.5], [100, 100, 150.5]), NoEstimate, "model's organ"),
         (random_points([-50, -50, 149.5], [50, 50, 150.5]), NoEstimate, "model's organ"),
         (random_points([-40, -40, 110], [40, 40, 190]), NoEstimate, "model's organ"),

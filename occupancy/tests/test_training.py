@@ -255,8 +255,8 @@ def a_run(case: Path, **changes: object) -> TrainingRun:
     ("changes", "words"),
     [
         ({"seed": -1}, "seed is -1"),
-        ({"checkpoint_every_s": float("nan")}, "--checkpoint-every is nan"),
-        ({"checkpoint_every_s": -1.0}, "--checkpoint-every is -1"),
+        ({"checkpoint_every_s": float("nan")}, "checkpoint_every_s= is nan"),
+        ({"checkpoint_every_s": -1.0}, "checkpoint_every_s= is -1"),
         ({"minutes": float("nan")}, "minutes is nan"),
         ({"workers": -1}, "workers is -1"),
         ({"steps": 0}, "steps is 0"),

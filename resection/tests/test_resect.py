@@ -659,7 +659,7 @@ def test_from_python_too_a_real_arm_needs_the_live_loop_and_a_person(given, monk
         resection.opened().__enter__()
     with pytest.raises(InputError, match=r"127\.0\.0\.1 was not confirmed"):
         resection.following().__enter__()
-    with pytest.raises(InputError, match="It needs: --live MODEL SOURCE"):
+    with pytest.raises(InputError, match=r"It needs: live=\(MODEL, SOURCE\)"):
         begin_resection(given / "plan", [REAL])
     with pytest.raises(InputError, match="give sinks as on the command line"):
         begin_resection(given / "plan", [object()])

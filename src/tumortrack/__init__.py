@@ -9,6 +9,7 @@ loaded when it is first used: importing this package imports no heavy library.
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -57,9 +58,25 @@ __version__ = "0.2.0"
 __all__ = sorted(_HOMES)
 
 
+class _Renamed:
+    """The last finder of modules: what no other found may have had another place."""
+
+    @staticmethod
+    def find_spec(name: str, path: Any = None, target: Any = None) -> None:
+        if name.startswith(__name__):
+            from tumortrack.core.renamed import refuse_module
+
+            refuse_module(name)
+
+
+sys.meta_path.append(_Renamed)
+
+
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from tumortrack.core.renamed import attributes_of
+
+        return attributes_of(__name__)(name)
     home = f"{__name__}.{_HOMES[name]}"
     if name in ("datasets", "errors", "presets"):
         return import_module(f"{home}.{name}")

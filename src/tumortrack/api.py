@@ -268,6 +268,7 @@ def train(
         report: of a training: called every few seconds.
         progress: of making a model that learns nothing: steps done, of how many.
     """
+    from tumortrack.core.renamed import hint
     from tumortrack.io.model_folder import check_trainable
     from tumortrack.registration.config import RegistrationConfig
     from tumortrack.registration.method import TrainOptions, method_of_config, method_of_preset
@@ -280,7 +281,8 @@ def train(
         if value is not None and not value >= 0:
             raise InputError(f"--{name} {value} must be 0 or more.")
     if preset not in PRESETS:
-        raise InputError(f"there is no preset {preset!r}; allowed: {', '.join(PRESETS)}.")
+        said = hint("choices", f"--preset {preset}")
+        raise InputError(f"there is no preset {preset!r}{said}; allowed: {', '.join(PRESETS)}.")
     if config is not None and (rotations or sensor):
         raise InputError("rotations and sensor are a preset's; a configuration says them itself.")
     known = case if isinstance(case, Case) else load_case(case)

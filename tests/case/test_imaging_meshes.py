@@ -72,7 +72,7 @@ def test_unclear_names_are_refused(tmp_path):
 
 def test_metres_are_recognised_and_converted_on_request(tmp_path):
     save(tmp_path, "kidney.obj", trimesh.Trimesh(ORGAN.vertices / 1000, ORGAN.faces))
-    with pytest.raises(InputError, match="--unit m"):
+    with pytest.raises(InputError, match='unit="m"'):
         read(tmp_path)
     anatomy, _ = read(tmp_path, "m")
     assert anatomy.organ.volume_mm3 == pytest.approx(ORGAN.volume, rel=1e-3)

@@ -227,7 +227,7 @@ def test_swapped_labels_a_misspelt_name_and_a_lost_geometry_are_noted(tmp_path):
     write_nifti(path, labels, np.diag([-1.0, -1, 1, 1]), "sform")  # RAS: identity
     swapped = PrepareOptions(name="livr", organ=2, tumor=1)
     termed = replace(swapped, term=("10200004", "Liver"))
-    saying = "identity", "swapped", "--name liver"
+    saying = "identity", "swapped", 'name="liver"'
     for options, told in (
         (PrepareOptions(name="liver"), saying[:1]), (swapped, saying), (termed, saying[:2]),
     ):  # fmt: skip

@@ -162,7 +162,7 @@ def test_the_verdict_is_said_before_anything_is_written(raw, clinic_model, monke
 @pytest.mark.parametrize(
     ("depth_mm", "unit_mm", "better"),
     [(130.0, 0.1, ""), (130.0, 1.0, ""), (700.0, 0.1, ""), (13.0, 0.1, "1 mm"),
-     (1300.0, 1.0, "--depth-unit 0.1"), (130_000.0, 1000.0, "1 mm"), (1.0, 0.1, "mm a step")],
+     (1300.0, 1.0, "depth_unit=0.1"), (130_000.0, 1000.0, "1 mm"), (1.0, 0.1, "mm a step")],
 )  # fmt: skip
 def test_a_unit_is_questioned_only_where_it_cannot_be_right(depth_mm, unit_mm, better):
     """700 mm is far away, and no unit would bring it near."""

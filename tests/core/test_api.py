@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import tumortrack as tt
+from camera_objects import Notes
 from live_objects import ball, small_estimate
 from tumortrack.core.estimate import LocatedPart
 from tumortrack.live.meter import RunStatistics
@@ -241,7 +242,7 @@ def test_an_evaluation_is_of_frozen_figures(phantom_case):
 
 
 def test_the_figures_of_a_run_are_frozen():
-    statistics, sink = RunStatistics(), SinkWorker("mine", SimpleNamespace(close=print), 1)
+    statistics, sink = RunStatistics(), SinkWorker("mine", Notes(), 1)
     statistics.latency.add(12.0)
     sink.close()
     more = {"dropped": 3, "opened": 1, "latency_from": "frame", "defects": []}

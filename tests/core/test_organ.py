@@ -26,7 +26,7 @@ UP = (0.0, -1.0, 0.0)
     "name", ["Liver", "tumor_1", "left kidney", "", "2nd", "../x", "a" * 33, "cloud", "a_margin"]
 )
 def test_names_that_no_file_could_bear_are_refused(name):
-    with pytest.raises(InputError, match="--name"):
+    with pytest.raises(InputError, match="name="):
         Organ(name=name)
 
 
@@ -76,7 +76,7 @@ def test_a_case_that_names_no_organ_or_a_strange_one_is_refused(tmp_path):
     with pytest.raises(ArtifactError, match="prepare"):
         load_case(tmp_path)
     path.write_text(json.dumps({**manifest, "organ": {"name": "../../x"}}))
-    with pytest.raises(ArtifactError, match="--name"):
+    with pytest.raises(ArtifactError, match="name="):
         load_case(tmp_path)
 
 

@@ -65,7 +65,7 @@ def test_existing_folder_is_refused_or_swapped(tmp_path):
         write_case(tmp_path / "case", content)
     assert leftovers(tmp_path / "case") == ["manifest.json", "new"]
     with (
-        pytest.raises(InputError, match="--overwrite"),
+        pytest.raises(InputError, match="overwrite=True"),
         store.new_folder(tmp_path / "case", overwrite=False),
     ):
         pytest.fail("the body must not run")

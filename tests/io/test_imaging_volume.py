@@ -88,9 +88,9 @@ def test_among_several_series_the_only_real_ct_is_taken_or_a_list_given(tmp_path
     assert np.array_equal(read_volume(tmp_path).hu, array)
     assert np.array_equal(read_volume(tmp_path, "1.2.5").hu, array + 1)
     write_dicom(tmp_path, array + 2, LPS, uid="1.2.6")
-    with pytest.raises(InputError, match=r"--series(.|\n)*1\.2\.3, series 1\.2\.3, CT, 39 slices"):
+    with pytest.raises(InputError, match=r"series=(.|\n)*1\.2\.3, series 1\.2\.3, CT, 39 slices"):
         read_volume(tmp_path)
-    with pytest.raises(InputError, match="--series"):
+    with pytest.raises(InputError, match="series="):
         read_volume(tmp_path, "9.9")
 
 

@@ -162,7 +162,7 @@ def test_points_mm_wins_and_contradicts_metres(points, tmp_path):
     path = tmp_path / "cloud.npz"
     path.write_bytes(npz_bytes(points=points / 1000, points_mm=points))
     np.testing.assert_array_equal(read_cloud(path)[0].points_mm, points)
-    with pytest.raises(InputError, match="--unit m"):
+    with pytest.raises(InputError, match='unit="m"'):
         read_cloud(path, unit="m")
 
 

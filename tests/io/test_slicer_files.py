@@ -264,7 +264,7 @@ def test_export_writes_both(tmp_path: Path, capsys: pytest.CaptureFixture) -> No
     with pytest.raises(InputError):
         Export(case=tmp_path / "case", out=tmp_path / "out").run()
     for option in ({"series": "1"}, {"patient": "PHANTOM"}):
-        with pytest.raises(InputError, match=f"--{next(iter(option))}"):
+        with pytest.raises(InputError, match=f"{next(iter(option))}="):
             Export(case=tmp_path / "case", out=tmp_path / "new", **option).run()
     with pytest.raises(InputError):  # of an empty variable, say
         Export(out=tmp_path / "new", **{**asked, "patient": ""}).run()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import shutil
 import sys
@@ -9,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.metadata import PackageNotFoundError, entry_points, requires, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
@@ -22,6 +23,7 @@ from tumortrack.core.errors import TumortrackError
 from tumortrack.core.packages import to_install
 from tumortrack.core.plugins import plugins
 from tumortrack.core.process import available_cores
+from tumortrack.core.renamed import hint, table
 from tumortrack.native import LIBRARIES, library
 
 # What each distribution is for, and each of its extras; "": what it always needs.
@@ -87,6 +89,8 @@ class Doctor:
             with suppress(Exception):  # what fails is among the findings
                 for line in method.loaded.hardware():
                     say(line)
+        for line in _old_names():
+            say(line)
         if broken:
             raise TumortrackError(
                 f"{broken} of what is installed does not work: see BROKEN above. The rest does."
@@ -105,6 +109,15 @@ def _statuses() -> Iterator[Status]:
         yield "ok", f"compiled kernels, in {LIBRARIES}"
     except (ImportError, OSError) as error:
         yield "BROKEN", f"compiled kernels: {error}"
+
+
+def _old_names() -> Iterator[str]:
+    """Variables that are set, and entry points of groups, that nothing reads any more."""
+    for name in filter(os.environ.__contains__, table()["variables"]):
+        yield f"nothing reads {name}{hint('variables', name)}"
+    for group in table()["entry_points"]:
+        for point in entry_points(group=group):
+            yield f"nothing reads {point.value} in {group}{hint('entry_points', group)}"
 
 
 def _plug_ins() -> Iterator[Status]:

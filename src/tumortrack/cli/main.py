@@ -15,6 +15,8 @@ import tumortrack
 from tumortrack.core.errors import InputError, PackageError, TumortrackError
 from tumortrack.core.packages import to_install
 from tumortrack.core.process import interrupt_between_imports
+from tumortrack.core.renamed import in_command
+from tumortrack.core.wording import command_line
 
 
 @runtime_checkable
@@ -65,6 +67,11 @@ def run(arguments: list[str]) -> int:
     if arguments == ["--version"]:
         print(f"tumortrack {tumortrack.__version__}")
         return 0
+    with command_line():
+        return _run(arguments)
+
+
+def _run(arguments: list[str]) -> int:
     code = 1
     try:
         code = _parse(arguments).run() or 0
@@ -72,6 +79,10 @@ def run(arguments: list[str]) -> int:
     except TumortrackError as error:
         print(f"tumortrack: {error}", file=sys.stderr)
         return error.exit_code
+    except SystemExit as ended:  # of --help, or options that are none
+        for line in in_command(arguments) if ended.code else ():
+            print(f"tumortrack: {line}", file=sys.stderr)
+        raise
     except KeyboardInterrupt:
         print("tumortrack: stopped.", file=sys.stderr)
         return _STOPPED

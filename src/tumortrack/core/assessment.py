@@ -10,6 +10,7 @@ import msgspec
 
 from tumortrack.core.organ import is_tumor
 from tumortrack.core.report import Finding, Likely, NextEvidence, Point
+from tumortrack.core.wording import for_caller
 
 Quality = Literal["good", "poor", "none"]  # none: there is no estimate
 NOT_JUDGED = Finding("not_judged")
@@ -55,7 +56,7 @@ class Assessment(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def reason(self) -> str:
         """Why it is poor and what to do; empty: it is good."""
-        return "" if self.finding is None else self.finding.words + self.advice
+        return "" if self.finding is None else self.finding.words + for_caller(self.advice)
 
     @property
     def factor_words(self) -> str:

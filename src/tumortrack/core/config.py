@@ -7,10 +7,11 @@ from typing import Any, TypeVar
 import msgspec
 
 from tumortrack.core.errors import InputError, readable
+from tumortrack.core.renamed import Renamed, of_unknown_key
 from tumortrack.core.report import Finding
 
 
-class Config(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Config(msgspec.Struct, Renamed, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of every configuration. Members of a union (one kind, one file) add ``tag=...``."""
 
     def check_ranges(self, what: str, least: str = "0 (off)", **most: float) -> None:
@@ -54,7 +55,8 @@ def from_builtins(data: object, kind: type[C], where: str) -> C:
     try:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
-        raise InputError(f"{where}: not a valid {kind.__name__}: {error}.") from error
+        said = of_unknown_key(kind, str(error))
+        raise InputError(f"{where}: not a valid {kind.__name__}: {error}{said}.") from error
     except InputError as error:  # of its own checks
         if type(error) is not InputError:  # of a package: it says which
             raise

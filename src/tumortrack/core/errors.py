@@ -6,8 +6,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from tumortrack.core.renamed import attributes_of
+from tumortrack.core.wording import for_caller
+
 if TYPE_CHECKING:
     from tumortrack.core.report import Finding, Likely
+else:
+    __getattr__ = attributes_of(__name__)
 
 # Of `locate`, by its verdict; each of them with a folder written.
 EXIT_STATUSES = {"good": 0, "poor": 4, "none": 3}
@@ -15,9 +20,13 @@ EXIT_STATUSES = {"good": 0, "poor": 4, "none": 3}
 
 class TumortrackError(Exception):
     """Base of errors raised on purpose: the command line prints the message on one line and exits
-    with ``exit_code``. Any other exception is a bug and keeps its traceback."""
+    with ``exit_code``. Any other exception is a bug and keeps its traceback. The message names
+    options as the command line does there, and elsewhere as keywords."""
 
     exit_code = 1
+
+    def __str__(self) -> str:
+        return for_caller(Exception.__str__(self))
 
 
 class InputError(TumortrackError):
@@ -28,8 +37,6 @@ class InputError(TumortrackError):
 
 class UnknownPart(InputError, KeyError):
     """A name that no part of an estimate has."""
-
-    __str__ = Exception.__str__  # KeyError's shows the message in quotes
 
 
 @contextmanager

@@ -11,7 +11,9 @@ from typing import Any, Literal
 
 import msgspec
 
+from tumortrack.core.renamed import Renamed
 from tumortrack.core.tables import read_table
+from tumortrack.core.wording import for_caller
 
 Point = tuple[float, float, float]
 
@@ -60,7 +62,7 @@ class _WithoutNumbers(string.Formatter):
         return value if isinstance(value, str) else "#"
 
 
-class Finding(msgspec.Struct, frozen=True):
+class Finding(msgspec.Struct, Renamed, frozen=True):
     """What speaks against an answer, or why there is none, or what weakens a case for good, which
     every answer repeats: a kind and its values, from which the sentence is made."""
 
@@ -73,7 +75,7 @@ class Finding(msgspec.Struct, frozen=True):
 
     @property
     def words(self) -> str:
-        return _SENTENCES[self.kind].format(**self.values)
+        return for_caller(_SENTENCES[self.kind].format(**self.values))
 
     @property
     def words_without_numbers(self) -> str:
@@ -89,7 +91,7 @@ class Finding(msgspec.Struct, frozen=True):
 Note = str | Finding  # of how a case was made: in passing, or a weakness
 
 
-class _Value(msgspec.Struct, frozen=True, kw_only=True):
+class _Value(msgspec.Struct, Renamed, frozen=True, kw_only=True):
     """Written whole, and read whatever else a file holds."""
 
 

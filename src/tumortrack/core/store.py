@@ -19,15 +19,9 @@ from typing import Any
 
 import tumortrack
 from tumortrack.core.errors import ArtifactError, InputError, StorageError
+from tumortrack.core.remake import remaking
 
-SCHEMA = 5  # raise it with every change of a folder's content or of what its numbers depend on
-_MADE_BY = {  # by kind
-    "case": "prepare INPUT CASE",
-    "twin": "twin CASE SCENES",
-    "model": "train CASE MODEL",
-    "run": "locate MODEL CLOUD OUT",
-    "plan": "plan RUN PLAN",
-}
+SCHEMA = 6  # raise it with every change of a folder's content or of what its numbers depend on
 MANIFEST = "manifest.json"
 _LARGEST_MANIFEST = 16 * 2**20  # bytes: refused before it is read
 
@@ -148,7 +142,7 @@ def check_place(path: Path, kind: str, overwrite: bool | None) -> None:
     except OSError as error:  # a name that is too long
         raise InputError(f"{path} cannot be written: {error.strerror}.") from error
     if not overwrite:
-        advice = "." if overwrite is None else ", or give --overwrite (overwrite=True)."
+        advice = "." if overwrite is None else ", or give --overwrite."
         raise InputError(f"{path} exists already. Choose another path{advice}")
     if not path.is_dir():
         raise InputError(f"{path} is a file; only a {kind} folder is replaced.")
@@ -265,10 +259,11 @@ def read_manifest(folder: Path, kind: str) -> dict[str, Any]:
     if manifest.get("kind") != kind:
         raise ArtifactError(f"{folder} is a {manifest.get('kind')!r}; a {kind!r} is needed here.")
     if manifest.get("schema") != SCHEMA:
-        command = f": tumortrack {_MADE_BY[kind]}" if kind in _MADE_BY else ""
+        parent = folder.absolute().parent / MANIFEST
+        command = remaking(folder, manifest, read_json(parent) if parent.is_file() else {})
         raise ArtifactError(
             f"{folder} has schema {manifest.get('schema')!r}; this tumortrack reads schema "
-            f"{SCHEMA}. Make it again with this version{command}."
+            f"{SCHEMA}. Make it again with this version{': ' * bool(command)}{command}"
         )
     files = manifest.get("files")
     if not isinstance(files, dict):

@@ -18,6 +18,7 @@ from jaxtyping import Float, Float32, Float64, Int32, UInt8
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spread_over
 from tumortrack.core.organ import KIDNEY, Organ
+from tumortrack.core.renamed import Renamed
 
 OUTSIDE, ORGAN, FIRST_TUMOR = 0, 1, 2
 
@@ -96,7 +97,7 @@ class CameraLabels:
 
 
 @dataclass(frozen=True, eq=False)
-class Mesh:
+class Mesh(Renamed):
     """A triangle surface; the variable that holds it names the frame. Faces turn outward."""
 
     vertices_mm: Float64[np.ndarray, "v 3"]
@@ -150,7 +151,7 @@ class Mesh:
 
 
 @dataclass(frozen=True, eq=False)
-class Anatomy:
+class Anatomy(Renamed):
     """Closed surfaces: ``parts[0]`` is the union of organ and tumors, and so the visible surface;
     ``parts[n]`` is the tumor labelled n + 1. ``structures``: further surfaces that move with the
     organ, closed or open."""
@@ -283,7 +284,7 @@ class SensorCloud:
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class Look(Renamed):
     """The organ seen by another camera or from another place: its points, ``cloud``, and all that
     was ``seen``, in that camera's frame; ``camera_from_look`` leads to the first camera's."""
 

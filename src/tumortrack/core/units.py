@@ -52,7 +52,7 @@ class Unit(Enum):
 
 
 _OF_CLOUD = {
-    Unit.METRE: "it looks like metres: give --unit m",
+    Unit.METRE: "it looks like metres: multiply it by 1000 (of a file: --unit m)",
     Unit.INCH: "it looks like inches: multiply it by 25.4",
     Unit.CENTIMETRE: "it looks like centimetres, or steps of 1 mm read as 0.1: multiply it by 10",
     Unit.TENTH: "it looks like tenths of a millimetre: divide it by 10",

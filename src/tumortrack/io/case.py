@@ -104,8 +104,9 @@ def load_case(folder: str | Path) -> Case:
     """Read a folder that ``prepare`` wrote, every file checked against its sha256. Raises
     ArtifactError: not a case, of another schema, damaged or changed since."""
     folder = Path(folder)
+    content = store.read_manifest(folder, KIND)
     try:
-        manifest = msgspec.convert(store.read_manifest(folder, KIND), _Manifest)
+        manifest = msgspec.convert(content, _Manifest)
         for name in manifest.structures:
             check_name(name, "a structure", "--structure")
         warnings = findings_in(manifest.warnings, str(folder))

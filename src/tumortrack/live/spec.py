@@ -19,6 +19,7 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.packages import to_install
 from tumortrack.core.plugins import Plugin, names, plugins
+from tumortrack.core.renamed import hint
 from tumortrack.core.report import Point
 from tumortrack.live.poses import PosesConfig
 from tumortrack.live.tools import ToolConfig
@@ -121,7 +122,8 @@ def _filled(config: type[C], target: str, options: str, where: str) -> C:
     if target:
         given[target_name] = target
     if unknown := [key for key in given if key not in fields]:
-        raise refused(f": {unknown[0]!r} is no option")
+        said = hint("keys", f"{config.__name__}.{unknown[0]}")
+        raise refused(f": {unknown[0]!r} is no option{said}")
     if missing := [n for n, f in fields.items() if f.required and n not in given]:
         raise refused(f" lacks its {missing[0]}")
     try:

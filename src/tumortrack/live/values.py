@@ -23,6 +23,7 @@ from tumortrack.core.estimate import NO_CHECK_FAILED, UNVERIFIED, Estimate
 from tumortrack.core.evidence import Evidence
 from tumortrack.core.geometry import Affine, rigid, transform_points
 from tumortrack.core.patient import NOBODY, Patient
+from tumortrack.core.renamed import Renamed
 from tumortrack.core.report import Finding
 from tumortrack.core.types import Anatomy, DepthFrame, Mesh, SensorCloud
 
@@ -197,7 +198,7 @@ class ControlState:
 
 
 @dataclass(frozen=True, eq=False)
-class TrackingResult:
+class TrackingResult(Renamed):
     """The loop's result for one frame: an estimate, or the reason why there is none.
 
     Attributes:
@@ -385,7 +386,7 @@ class Controls:
 
 
 @dataclass(frozen=True, eq=False)
-class SinkContext:
+class SinkContext(Renamed):
     """What a sink knows when it is opened. ``parts``: of the model, the organ first.
     ``anatomy_ct``: the organ in the CT (LPS, mm), if the model has it: estimates then have a
     motion, and their meshes its triangles. ``controller``: acts on results, which then have its

@@ -13,6 +13,7 @@ from jaxtyping import Float32, Float64
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Affine, Points, largest_std_of, rigid, std_of, turned_by
 from tumortrack.core.process import parallel_for
+from tumortrack.core.renamed import Renamed
 from tumortrack.native import F32, F64, kernel
 from tumortrack.organ.flow import FLOW, MODES, Flow, LatticeField, steps_for
 from tumortrack.organ.rest_shape import DISTANCES, DistanceField, RestShape
@@ -54,7 +55,7 @@ def residual_rows(
 
 
 @dataclass(frozen=True, eq=False)
-class ElasticMotion:
+class ElasticMotion(Renamed):
     """``core.estimate.Motion`` of a shape: x -> rotation (flow(x) - center_ct) + centre_mm.
 
     Attributes:

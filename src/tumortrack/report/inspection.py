@@ -11,6 +11,7 @@ from typing import Any
 from tumortrack.core import store
 from tumortrack.core.config import findings_in
 from tumortrack.core.errors import InputError
+from tumortrack.core.renamed import in_report
 from tumortrack.core.tables import read_table
 
 Content = Mapping[str, Any]  # of a JSON file
@@ -82,6 +83,8 @@ def _json(path: Path) -> list[str]:
         return _evaluation(content)
     for kind in _TABLE.values():
         if "keys" in kind and content.keys() >= {*kind["keys"]}:
+            if kind is _TABLE["run"] and (old := in_report(content)):
+                return [kind["name"], "An older version wrote it, whose keys differ", *old]
             filled = _words(_with_figures(content, path.parent), kind.get("sentences", ()))
             return [kind["name"], *filled]
     return []

@@ -14,6 +14,7 @@ from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.evidence import CAMERA, Evidence
+from tumortrack.core.wording import for_caller
 from tumortrack.io.evidence_files import read_evidence
 from tumortrack.io.points import PointTable, check_near_organ, read_points
 from tumortrack.report.seen import PAGE, Seen
@@ -208,7 +209,7 @@ def _no_estimate(
 
     reason = str(error)
     if view.unit is not None:
-        reason = f"{reason.rstrip('.')}; {_ASK}."
+        reason = f"{reason.rstrip('.')}; {for_caller(_ASK)}."
     return {
         **report_head(view.content.stamp_ns),
         "seed": options.seed,

@@ -156,9 +156,7 @@ def check_place(out: Path, overwrite: bool) -> None:
     if not out.exists():
         return
     if not overwrite:
-        raise InputError(
-            f"{out} exists already. Choose another path, or give --overwrite (overwrite=True)."
-        )
+        raise InputError(f"{out} exists already. Choose another path, or give --overwrite.")
     if not out.is_dir():
         raise InputError(f"{out} is a file; --overwrite replaces only a report's folder.")
     if not (inside := {path.name for path in out.iterdir()}):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.renamed import attributes_of
 from tumortrack.core.types import Anatomy
 from tumortrack.registration.base_model import ModelConfig
 from tumortrack.registration.config import Rotations, clinic
@@ -15,6 +16,8 @@ from tumortrack.simulation.noise import CLEAN, SENSORS, Sensor
 
 C = TypeVar("C", bound=ModelConfig)
 
+if not TYPE_CHECKING:
+    __getattr__ = attributes_of("tumortrack.presets")
 __all__ = ["PRESETS", "clinic", "paper", "quick", "seen_by"]
 
 
