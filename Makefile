@@ -153,7 +153,7 @@ rehearsal: setup  ## the experiment on a bench that does not exist, by all its c
 
 pictures: demo debian  ## the pictures in docs/images that the demo shows (docs/maintaining.md has the others; 10 minutes)
 	$(BIN)/python lab/scripts/picture.py runs/demo/case docs/images/demo.png
-	$(BIN)/tumortrack locate runs/demo/case runs/demo/dataset/1-rest/cloud.ply runs/pictures/run --depth-error 0 --overwrite
+	$(BIN)/tumortrack locate runs/demo/case runs/demo/dataset/1-rest/cloud.ply --out runs/pictures/run --depth-error 0 --overwrite
 	$(BIN)/tumortrack plan runs/pictures/run runs/pictures/plan --accept-budget --overwrite
 	cp runs/pictures/plan/plan.png docs/images/plan.png
 	rm -f docs/images/resection.gif  # a film replaces none

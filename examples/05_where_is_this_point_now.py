@@ -1,7 +1,7 @@
 """Points of the CT, such as a vessel or a planned cut, and where they are before the camera now.
 
 Run after 01: python examples/05_where_is_this_point_now.py [FOLDER]
-From the command line: tumortrack locate CASE CLOUD OUT --map points.csv
+From the command line: tumortrack locate CASE CLOUD --out OUT --map points.csv
 """
 
 import sys

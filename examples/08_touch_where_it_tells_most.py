@@ -1,7 +1,7 @@
 """Half of the organ is hidden: the answer without touches and with them, and what to touch next.
 
 Run after 01: python examples/08_touch_where_it_tells_most.py [FOLDER]
-From the command line: tumortrack locate CASE CLOUD OUT --evidence touches.json
+From the command line: tumortrack locate CASE CLOUD --out OUT --evidence touches.json
 """
 
 import sys

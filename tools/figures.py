@@ -29,6 +29,7 @@ _WHERE = {  # by section of renamed.toml
     "choices": "options' values",
     "keys": "keys of `--config` files, options of sinks",
     "report": "report.json",
+    "values": "values in report.json",
     "plan": "plan.json",
     "manifest": "a model's manifest.json",
     "variables": "environment variables",

@@ -205,7 +205,7 @@ def test_clouds_in_other_formats_and_units_agree(work, seen, out):
     np.savez(work / "metres.npz", points=points / 1000)
     refused = ["locate", work / "model", work / "metres.npz", "--out", work / "no"]
     for crop in ([], ["--range", "110", "150"]):  # the crop alone would find nothing in range
-        assert 'unit="m"' in refusal(tumortrack(*refused, *crop))
+        assert "--unit m" in refusal(tumortrack(*refused, *crop))
     assert not (work / "no").exists()
     other = ["locate", work / "model", work / "metres.npz", "--out", work / "metres", "--unit", "m"]
     succeeded(tumortrack(*other, "--grid", 32))

@@ -72,7 +72,7 @@ class _Renamed:
 sys.meta_path.append(_Renamed)
 
 
-def __getattr__(name: str) -> Any:
+def _loaded(name: str) -> Any:
     if name not in _HOMES:
         from tumortrack.core.renamed import attributes_of
 
@@ -81,6 +81,10 @@ def __getattr__(name: str) -> Any:
     if name in ("datasets", "errors", "presets"):
         return import_module(f"{home}.{name}")
     return getattr(import_module(home), name)
+
+
+if not TYPE_CHECKING:  # to a type checker what is not there stays so
+    __getattr__ = _loaded
 
 
 def __dir__() -> list[str]:

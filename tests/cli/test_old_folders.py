@@ -14,7 +14,7 @@ import pytest
 
 import tumortrack as tt
 from stories import succeeded, tumortrack
-from tumortrack.cli.main import run
+from tumortrack.cli.main import _parse, run
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError
 from tumortrack_resection.files import read_plan
@@ -91,6 +91,24 @@ def test_a_case_is_remade_as_it_was(old, capsys):
     assert (case.patient.id, case.patient.side) == ("P1", "right")
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"tilt": 0.0, "min_tumor_ml": 0.0, "labels": True, "tumor": [0], "up": "0,-0.5,1"},
+        {"organ": [1, 3], "structure": ["artery=4", "ureter=a b.stl"], "name": "liver"},
+        {"term": ["10200004", "Liver structure"], "organ_hu": [-50.5, 300.0], "unit": "m"},
+        {"rotations": "full", "sensor": "stereo", "side": None, "series": "2", "ct": "ct.nii"},
+    ],
+)
+def test_all_options_of_a_case_are_in_its_command(options, old, capsys):
+    manifest = store.read_json(Path("case/manifest.json"))
+    asked = {**manifest["report"]["options"], "side": None, **options}
+    store.write_json(Path("case/manifest.json"), {**manifest, "report": {"options": asked}})
+    parsed = _parse(shlex.split(remade(refused("inspect case", capsys))))
+    read = {name: getattr(parsed, name) for name in asked}
+    assert json.loads(json.dumps(read, default=str)) == asked
+
+
 def test_the_model_in_a_case_is_remade_with_it(old, capsys):
     shutil.copytree("model", "case/model")
     line = refused("locate case/model cloud.ply --out out", capsys)
@@ -119,7 +137,15 @@ def test_python_raises(read, kind, old):
         read(Path(kind))
 
 
-@pytest.mark.parametrize("spoilt", [{}, {"report": 5}, {"report": {"options": {"organ": {}}}}])
+@pytest.mark.parametrize(
+    "spoilt",
+    [
+        {},
+        {"report": 5},
+        {"report": {"options": {"organ": {}}}},
+        {"report": {"source": "INPUT\n", "options": {"side": "left\nright", "a\nb": 1}}},
+    ],
+)
 def test_a_manifest_that_says_little_is_refused_likewise(spoilt, old, capsys):
     store.write_json(Path("case/manifest.json"), {"kind": "case", "schema": 5, **spoilt})
     assert shlex.split(remade(refused("inspect case", capsys)))[:2] == ["prepare", "INPUT"]

@@ -26,7 +26,7 @@ from tumortrack.core.assessment import Assessment
 from tumortrack.core.config import from_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.renamed import NOTHING, attributes_of, hint, in_report, table
-from tumortrack.core.report import FitReport
+from tumortrack.core.report import Check, FitReport
 from tumortrack.live.spec import SINKS
 from tumortrack.tracking.presets import PRESETS
 from tumortrack_resection import files
@@ -207,6 +207,14 @@ def test_inspect_says_the_new_keys_of_an_old_report(tmp_path, capsys):
     assert run(["inspect", str(tmp_path / "report.json")]) == 0
     assert hint("report", "fit_cost.strays") in capsys.readouterr().out
     assert not in_report(json.loads(msgspec.json.encode(FitReport())))
+
+
+@of("values")
+def test_a_value_in_a_report(section, old):
+    key, _, value = old.partition(" = ")
+    kind = Check if key == "quality.check" else inner(Report, key.split("."))
+    assert value not in typing.get_args(kind)
+    assert {*code(section, old)} <= {*typing.get_args(kind)}
 
 
 @of("plan")

@@ -134,7 +134,7 @@ class Following(Follower):
     def last_box_mm(self, *_):
         return None
 
-    def locate(self, cloud, seen, evidence, way):
+    def locate(self, cloud, seen, *, views, evidence, camera_from_last):
         self.given.append(evidence)
         if self.fails:
             raise NoEstimate("hidden")

@@ -106,7 +106,7 @@ def test_one_call_locates_with_a_folder_or_a_model(slim_model, model, stages, es
         found = tt.locate(case, points, grid=48, seed=3)
         np.testing.assert_array_equal(found.cloud.points_mm, estimate.cloud.points_mm)
     assert isinstance(tt.locate(model, points_mm, grid=16), tt.Estimate)
-    with pytest.raises(InputError, match="metres.* 1000"):
+    with pytest.raises(InputError, match=r"metres.* 1000"):
         tt.locate(model, points_mm / 1000)
 
 

@@ -71,7 +71,7 @@ class Located(Tracker):
         self._verdicts, self.asked = list(verdicts), []
 
     def follow(self, cloud, last=None, how=None, seen=None, *, views=(), evidence=()):
-        self.asked.append((last, evidence))
+        self.asked.append((last, (*views, *evidence)))
         verdict = self._verdicts.pop(0) if self._verdicts else "good"
         if verdict == "none":
             raise NoEstimate("it does not look like this organ")

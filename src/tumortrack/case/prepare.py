@@ -27,6 +27,7 @@ from tumortrack.core.organ import Organ
 from tumortrack.core.patient import UNKNOWN, Patient, Side
 from tumortrack.core.report import Finding, Kind, Note
 from tumortrack.core.types import FIRST_TUMOR, ORGAN, Anatomy, LabelVolume, Mesh, Volume
+from tumortrack.core.wording import for_caller
 from tumortrack.io.case import Case
 from tumortrack.io.mesh_files import SUFFIXES
 from tumortrack.io.segments import Parts, is_tumor, other_organ
@@ -94,7 +95,7 @@ def prepare(input: Path | Sequence[Path], options: PrepareOptions | None = None)
             "warning": text,
             "turns": [{k: v for k, v in asdict(t).items() if k != "ct_from_ct"} for t in turns],
         },
-        "notes": [note for note in (*notes, text) if note and isinstance(note, str)],
+        "notes": [for_caller(n) for n in (*notes, text) if n and isinstance(n, str)],
     }
     return replace(
         case,

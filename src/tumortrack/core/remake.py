@@ -28,7 +28,7 @@ def remaking(folder: Path, manifest: Mapping[str, Any], parent: Mapping[str, Any
     if kind == "model" and parent.get("kind") == "case":  # it is made with its case
         folder, manifest, kind = folder.parent, parent, "case"
     if kind == "case":
-        source = str(_at(manifest, "report", "source") or "INPUT").split(", ")
+        source = _word(_at(manifest, "report", "source") or "INPUT").split(", ")
         options = _at(manifest, "report", "options")
         words = ["prepare", *source, "--out", str(folder), "--overwrite", *_options(options)]
     elif kind == "model":  # a training is never overwritten
@@ -48,24 +48,31 @@ def _at(content: object, *keys: str) -> Any:
     return content
 
 
+def _word(value: object) -> str:
+    """On one line, whatever a manifest says."""
+    return "".join(filter(str.isprintable, str(value)))
+
+
 def _options(options: object) -> Iterator[str]:
     """Of `prepare`, all that were not empty."""
     if not isinstance(options, Mapping):
         return
     for name, value in options.items():
-        flag, values = f"--{name.replace('_', '-')}", value if isinstance(value, list) else [value]
-        words = [f"{each:g}" if isinstance(each, float) else str(each) for each in values]
-        if value is True:
-            yield flag
-        elif name in _REPEATED:
+        if value is None or value is False or value in ("", []):
+            continue
+        flag, values = _word(f"--{name.replace('_', '-')}"), value
+        if not isinstance(value, list):
+            values = [] if value is True else [value]
+        words = [f"{each:g}" if isinstance(each, float) else _word(each) for each in values]
+        if name in _REPEATED:
             yield from (word for each in words for word in (flag, each))
-        elif value not in (None, False, "", []):
+        else:
             yield from (flag, *words)
 
 
 def _poses(manifest: Mapping[str, Any]) -> Iterator[str]:
     if (rotations := _at(manifest, "config", "scene", "pose", "rotations")) is not None:
-        yield from ("--rotations", str(rotations))
+        yield from ("--rotations", _word(rotations))
     if _at(manifest, "config", "network") is not None:
         yield from ("--preset", "PRESET")
 
@@ -73,4 +80,4 @@ def _poses(manifest: Mapping[str, Any]) -> Iterator[str]:
 def _states(manifest: Mapping[str, Any]) -> Iterator[str]:
     """Of a kit."""
     if isinstance(states := _at(manifest, "config", "base", "states"), list):
-        yield from ("--states", *map(str, states))
+        yield from ("--states", *map(_word, states))

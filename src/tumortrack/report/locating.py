@@ -167,6 +167,7 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
     if options.map is not None and points is not None:
         digest, count = store.sha256_of(options.map), len(points.points_ct)
         about["map"] = {"points": count, "from": "lps", "to": "camera", "sha256": digest}
+    about["notes"] = list(map(for_caller, about["notes"]))
     return Located(estimate, about, seen, points)
 
 
