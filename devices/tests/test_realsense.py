@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 import time
 
@@ -11,6 +10,7 @@ import pytest
 
 from clock import PATIENCE_S, until
 from realsense_objects import HEIGHT, WIDTH, Camera, raw_depth, record
+from refused import refused
 from tumortrack.core.errors import InputError
 from tumortrack.core.packages import to_install
 from tumortrack.core.types import Intrinsics
@@ -125,7 +125,7 @@ def test_frames_before_the_clocks_are_tied_are_left_out():
         camera.show(number, hardware_clock=True)
         assert source.read(0.5) is None
     camera.show(149, hardware_clock=True)
-    with pytest.raises(InputError, match=r"global_time=false"):
+    with refused(InputError, "global_time=false"):
         source.read(0.5)
     source.close()
 
@@ -156,18 +156,18 @@ def test_an_unplugged_camera_is_lost():
 def test_what_a_camera_cannot_do_is_said():
     with pytest.raises(InputError):
         RealSenseSource(Camera(distortion=0.1).device, RealSenseSourceConfig())
-    with pytest.raises(InputError, match="848x480@30"):
+    with refused(InputError, "848x480@30"):
         RealSenseSource(Camera().device, RealSenseSourceConfig(width=640))
 
 
 def test_what_is_not_there_is_said(tmp_path, monkeypatch):
-    with pytest.raises(InputError, match=r"none\.db3"):
+    with refused(InputError, "none.db3"):
         RealSenseSourceConfig(device=str(tmp_path / "none.db3")).open()
     (tmp_path / "torn.db3").write_bytes(b"x" * 5000)
-    with pytest.raises(InputError, match=r"torn\.db3"):
+    with refused(InputError, "torn.db3"):
         RealSenseSourceConfig(device=str(tmp_path / "torn.db3")).open()
     with pytest.raises(SourceLost):
         RealSenseSourceConfig(device="000000000000").open()  # no camera has it
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    with pytest.raises(InputError, match=re.escape(to_install("tumortrack-devices[realsense]"))):
+    with refused(InputError, to_install("tumortrack-devices[realsense]")):
         RealSenseSourceConfig().open()

@@ -30,6 +30,7 @@ from live_objects import (
     small_setting,
 )
 from recording_objects import PERIOD_NS, frame_number, play, record, update_number, write_bag
+from refused import refused
 from tumortrack.core import store
 from tumortrack.core.camera import d405
 from tumortrack.core.errors import InputError, StorageError
@@ -210,7 +211,7 @@ def test_a_file_cut_anywhere_gives_the_frames_before(tmp_path):
         assert len(play(cut_file)) in (found[-1], found[-1] + 1)
     assert set(found) >= {5, 4, 3, 2}
     cut_file.write_bytes(raw[: len(raw) // 10])
-    with pytest.raises(InputError, match=r"cut\.mcap"):
+    with refused(InputError, cut_file):
         play(cut_file)
     damaged, begins = bytearray(raw), [8]
     while raw[begins[-1]] != 0x0F:  # https://mcap.dev/spec: opcode, length, content
@@ -259,7 +260,7 @@ def test_what_is_there_is_never_written_into_and_what_is_no_recording_is_refused
     (tmp_path / "film.avi").touch()
     for there in (path, tmp_path / "other", path / "recording.json"):
         before = sorted(tmp_path.rglob("*"))
-        with pytest.raises(InputError, match=str(there)):
+        with refused(InputError, there):
             record(there, [])
         assert sorted(tmp_path.rglob("*")) == before
     assert len(play(path)) == 1
@@ -297,7 +298,6 @@ def test_a_full_disk_is_said_and_leaves_what_was_whole(tmp_path):
                 said.append(str(error))
         sink.close()
     assert len(set(said)) == 1
-    assert "File too large" in said[0]
     assert len(said) == 12 - written > 5
     got = play(tmp_path / "r")
     assert stamps(got) == [STAMP_NS + n * PERIOD_NS for n in range(len(got))]
@@ -340,7 +340,7 @@ def test_depth_images_beside_one_camera(tmp_path):
         np.testing.assert_allclose(seen.content.depth_mm, frame_number(n).depth_mm, rtol=2e-7)
     assert len(got) == 3
     (tmp_path / "intrinsics.json").unlink()
-    with pytest.raises(InputError, match=r"intrinsics\.json"):
+    with refused(InputError, "intrinsics.json"):
         RecordingSourceConfig(path=tmp_path).open()
 
 
@@ -383,7 +383,7 @@ def test_bags_of_every_kind_are_played(tmp_path, kind):
         (file,) = [p for p in path.iterdir() if p.suffix in (".mcap", ".db3")]
         assert stamps(play(file)) == stamps(frames)
     for options in ({"topic": "/nowhere"}, {"info_topic": "/arm/points"}):
-        with pytest.raises(InputError, match=r"nowhere|points"):
+        with refused(InputError, *options.values()):
             RecordingSourceConfig(path=path, **options).open()
 
 
@@ -394,9 +394,9 @@ def test_two_candidates_are_named_rather_than_guessed(tmp_path):
         "/right/depth": ("depth/image_rect", frames),
     }
     path = write_bag(tmp_path / "r", topics, "mcap")
-    with pytest.raises(InputError, match="/left/depth, /right/depth"):
+    with refused(InputError, "/left/depth, /right/depth"):
         RecordingSourceConfig(path=path).open()
-    with pytest.raises(InputError, match="camera_info"):
+    with refused(InputError, "camera_info"):
         RecordingSourceConfig(path=path, topic="/left/depth").open()
 
 
@@ -421,7 +421,7 @@ def test_a_bad_image_in_a_bag_is_said_and_passed(tmp_path):
 def test_rubbish_is_no_recording(tmp_path, name):
     (tmp_path / name).write_bytes(np.random.default_rng(1).bytes(3000))
     path = tmp_path if name == "metadata.yaml" else tmp_path / name
-    with pytest.raises(InputError, match="bag"):
+    with refused(InputError, path):
         RecordingSourceConfig(path=path).open()
 
 

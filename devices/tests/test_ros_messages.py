@@ -23,6 +23,7 @@ from live_objects import (
     small_setting,
     small_update,
 )
+from refused import refused
 from reports import bounded
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
@@ -171,7 +172,7 @@ def test_messages_that_lie_about_themselves_are_refused(what, change):
 def test_clouds_with_unusable_coordinates_are_refused(change):
     message = cloud_message()
     vars(message.fields[1]).update(change)
-    with pytest.raises(InputError, match=" z "):
+    with refused(InputError, " z "):
         cloud_of(message)
 
 
@@ -201,11 +202,11 @@ def test_a_camera_info_of_another_camera_or_of_none_is_refused():
     image = image_message(np.full((2, 3), 150, "<u2"), "16UC1")
     nameless, other = (HUMBLE.header(STAMP_NS, name) for name in ("", "leg"))
     assert depth_of(image, info_message(header=nameless)).stamp_ns == STAMP_NS
-    with pytest.raises(InputError, match=r"'arm'.*'leg'"):
+    with refused(InputError, "'arm'", "'leg'"):
         depth_of(image, info_message(header=other))
     for focal in (0.2, 16.0, 600.0):  # of 3 pixels: 0.3 to 15
         k = np.array([focal, 0, 1.25, 0, 6.5, 0.5, 0, 0, 1])
-        with pytest.raises(InputError, match="3 x 2"):
+        with refused(InputError, "3 x 2"):
             depth_of(image, info_message(k=k))
 
 
@@ -221,7 +222,7 @@ def test_a_rectified_image_has_the_camera_of_p_in_either_ros():
 def test_a_mask_is_what_is_not_zero():
     values = np.array([[0, 1, 255], [7, 0, 0]], np.uint8)
     np.testing.assert_array_equal(mask_of(image_message(values, "mono8", 3)), values > 0)
-    with pytest.raises(InputError, match="mask"):
+    with refused(InputError, "16UC1"):
         mask_of(image_message(values.astype(np.uint16), "16UC1"))
 
 
@@ -240,7 +241,7 @@ def test_a_picture_is_red_green_and_blue_of_the_depth_image_s_pixels_and_moment(
     np.testing.assert_array_equal(picture_of(grey, frame), rgb[..., 0])
     with pytest.raises(InputError):
         picture_of(image_message(rgb[1:, :, 0].copy(), "mono8"), frame)
-    with pytest.raises(InputError, match="16UC1"):
+    with refused(InputError, "16UC1"):
         picture_of(image_message(rgb[..., 0].astype(np.uint16), "16UC1"), frame)
 
 
@@ -387,7 +388,7 @@ def test_a_part_that_was_not_found_is_deleted_and_meshes_may_wait():
 
 @pytest.mark.parametrize("stamp_ns", [-1, 2**31 * 10**9])
 def test_stamps_that_ros_cannot_say_are_refused(stamp_ns):
-    with pytest.raises(InputError, match="2038"):
+    with refused(InputError, 2038):
         HUMBLE.header(stamp_ns, "camera")
 
 

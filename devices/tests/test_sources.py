@@ -21,7 +21,6 @@ from clock import PATIENCE_S, until
 from depth_files import write_frame_folder
 from recording_objects import frame_number, record, update_number
 from theatre_objects import small_theatre
-from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.values import Observation, Source, SourceEnded, SourceLost
 from tumortrack_devices.sources.realsense import RealSenseSource, RealSenseSourceConfig
@@ -70,18 +69,12 @@ def ros2_clouds(_folder: Path) -> Iterator[Source]:
 @contextmanager
 def _ros2(kind: str) -> Iterator[Source]:
     needs.module("cyclonedds", "tumortrack-devices, x86-64, Python up to 3.13")
-    from ros2_objects import own_graph, sending
+    from ros2_objects import own_graph, read_until, sending
     from tumortrack_devices.sources.ros import Ros2SourceConfig
 
     with own_graph(), sending(kind) as topic:
         source = Ros2SourceConfig(topic=topic).open()
-
-        def whole() -> bool:  # an image may be here before the first CameraInfo
-            with contextlib.suppress(InputError):
-                return source.read(0.1) is not None
-            return False
-
-        until(whole)
+        read_until(source)
         yield source
 
 

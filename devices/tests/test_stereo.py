@@ -14,6 +14,7 @@ from scipy.special import ndtr
 
 from clock import PATIENCE_S
 from depth_objects import SMALL, pixels
+from refused import refused
 from stereo_objects import endoscope, over_a_table, placed_before
 from tumortrack import api
 from tumortrack.core.errors import InputError
@@ -85,7 +86,7 @@ def test_the_nearer_surface_spreads_as_the_noise_model_says(seen):
 
 
 def test_pictures_of_another_size_are_refused(seen, unchecked):
-    with pytest.raises(InputError, match="640 x 480"):
+    with refused(InputError, "640 x 480"):
         seen.rig.rectified(seen.left[1:], seen.right)
 
 
@@ -137,7 +138,7 @@ def test_a_calibration_of_opencv_s_is_read(tmp_path, suffix):
 )
 def test_a_file_that_is_no_calibration_is_refused(tmp_path, text):
     (file := tmp_path / "stereo.yaml").write_text(text)
-    with pytest.raises(InputError, match=r"stereo\.yaml"):
+    with refused(InputError, file):
         read_calibration(file)
 
 
@@ -156,13 +157,12 @@ def test_a_file_that_is_no_calibration_is_refused(tmp_path, text):
 )
 def test_a_pair_that_cannot_be_is_refused(changed):
     (name,) = changed.keys() - {"unit"}
-    where = "OpenCV" if name == "D1" else name
-    with pytest.raises(InputError, match=where):
+    with refused(InputError, *({name} - {"D1"})):
         StereoRig(msgspec.structs.replace(endoscope(), **changed))
 
 
 def test_things_too_near_to_be_matched_are_refused():
-    with pytest.raises(InputError, match="near_mm=2 "):
+    with refused(InputError, "near_mm=2 "):
         StereoRig(endoscope(), near_mm=2.0)
 
 
@@ -213,7 +213,7 @@ def test_a_preset_s_scenes_can_be_those_of_stereo(phantom_case):
     assert stereo.scene.noise == STEREO_NOISE != D405_NOISE
     assert msgspec.structs.replace(stereo.scene, noise=D405_NOISE) == clinic.scene
     clean = msgspec.structs.replace(clinic.scene, noise=CLEAN)
-    with pytest.raises(InputError, match="preset quick"):
+    with pytest.raises(InputError):
         presets.seen_by(msgspec.structs.replace(clinic, scene=clean), "stereo")
 
 
@@ -258,7 +258,7 @@ def test_every_pair_becomes_a_depth_image_with_the_left_picture(folder):
         off = np.abs(seen.picture[..., ::-1].astype(int) - blue_first)
         assert np.median(off[20:-20, 20:-20]) <= 2  # red first, in the depth image's pixels
     for _ in range(2):
-        with pytest.raises(SourceEnded, match="first 3"):
+        with refused(SourceEnded, 3):
             source.read(PATIENCE_S)
     source.close()
     source.close()
@@ -283,10 +283,10 @@ def test_what_can_be_no_pair_is_refused(text):
 
 
 def test_what_is_not_there_is_said_by_us_alone(folder, capfd):
-    with pytest.raises(InputError, match="nowhere"):
+    with refused(InputError, "nowhere.avi"):
         SOURCES.parse(spec(folder, left="nowhere.avi")).open()
-    with pytest.raises(SourceLost, match="/dev/video97"):
+    with refused(SourceLost, "/dev/video97"):
         SOURCES.parse(f"stereo:97,98?calibration={folder / 'stereo.json'}").open()
-    with pytest.raises(InputError, match=r"stereo\.json"):
+    with refused(InputError, "/nowhere/stereo.json"):
         SOURCES.parse("stereo:97,98?calibration=/nowhere/stereo.json").open()
     assert capfd.readouterr() == ("", "")

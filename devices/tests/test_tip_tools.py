@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 import needs
 from clock import PATIENCE_S, Clock, until
 from live_objects import STAMP_NS, small_anatomy, small_estimate, small_frame, small_setting
+from refused import refused
 from rtde_arm import RtdeArm
 from tumortrack.core.assessment import NOT_JUDGED
 from tumortrack.core.errors import InputError
@@ -252,23 +253,23 @@ def test_a_tool_whose_poses_end_gives_nothing_and_says_so_once(tmp_path):
 @pytest.mark.parametrize(
     ("options", "published", "named"),
     [
-        ({"tip_mm": 99.0}, BASE, "tip_mm is 99"),
-        ({"shaft_mm": 2.0}, BASE, "shaft_mm is 2"),
-        ({"holds": True, "sweep": True}, BASE, "holds, sweep"),
-        ({"part": "spleen"}, BASE, "spleen.*kidney, tumor_1"),
-        ({}, PublishedFrame(), "base.*camera.*frame=FILE"),
+        ({"tip_mm": 99.0}, BASE, ["tip_mm", 99]),
+        ({"shaft_mm": 2.0}, BASE, ["shaft_mm", 2]),
+        ({"holds": True, "sweep": True}, BASE, ["holds, sweep"]),
+        ({"part": "spleen"}, BASE, ["spleen", "kidney, tumor_1"]),
+        ({}, PublishedFrame(), ["'base'", "'camera'", "frame=FILE"]),
     ],
 )
-def test_what_cannot_be_is_one_clear_line(options, published, named, tmp_path):
+def test_what_cannot_be_is_refused(options, published, named, tmp_path):
     path = table(tmp_path / "t.csv", [facing((0, 0, 120))] * 3, [False] * 3)
-    with pytest.raises(InputError, match=named):
+    with refused(InputError, *named):
         FileToolConfig(path=path, **options).open(setting(published), "probe")
 
 
 def test_a_table_without_contacts_serves_for_a_shaft_alone(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text(f"{COLUMNS}\n{pose_row(STAMP_NS, 'base', facing((0, 0, 120)))}")
-    with pytest.raises(InputError, match=r"t\.csv"):
+    with refused(InputError, path):
         FileToolConfig(path=path).open(setting(), "probe")
     tool = FileToolConfig(path=path, shaft_mm=10.0).open(setting(), "probe")
     assert [piece.name for piece in tool.evidence(view(STAMP_NS))] == ["free"]
@@ -356,21 +357,21 @@ def test_damaged_messages_are_named_and_the_next_ones_are_heard(tracker):
         sock = link()
         whole = pack(Message("TRANSFORM", "Stylus", 1, igtl.pack_transform(np.eye(4))))
         sock.sendall(whole[:-1] + bytes([whole[-1] ^ 1]))
-        named("checksum is wrong")
+        named("checksum")
         sent(sock, "TRANSFORM", "Stylus", igtl.pack_transform(2 * np.eye(4)))
-        named("not rigid")
+        named("rigid")
         sent(sock, "TRANSFORM", "Stylus", bytes(7))
-        named("has 48 bytes, not 7")
+        named("48 bytes")
         sent(sock, "STRING", "contact", string("perhaps"))
-        named("'perhaps'; allowed: 1 or 0")
+        named("'perhaps'")
         sent(sock, "STRING", "contact", b"\0\3\0\5ab")
-        named("a STRING is cut off")
+        named("STRING")
         sent(sock, "POINT", "F", b"ab")
-        named("a POINT is of pieces of 136 bytes; 2 came")
+        named("136 bytes")
         sent(sock, "POLYDATA", "kidney", bytes([255] * 40))
-        named("a POLYDATA is cut off")
+        named("POLYDATA")
         sock.sendall(whole[:42] + (2**40).to_bytes(8, "big") + whole[50:])
-        named("a message of 1099511627776 bytes is refused")
+        named("1099511627776")
         again = link()  # it comes back
         for _ in range(3):
             sent(again, "TRANSFORM", "Stylus", igtl.pack_transform(facing((0, 0, 120))))
@@ -444,7 +445,7 @@ def test_what_is_drawn_in_slicer_counts_once_it_rests(monkeypatch):
 
 def test_a_pointer_needs_the_calibration_that_drawings_do_not():
     config = OpenIgtLinkToolConfig(address="127.0.0.1:18944", name="Stylus")
-    with pytest.raises(InputError, match="frame=FILE"):
+    with refused(InputError, "frame=FILE"):
         config.open(setting(PublishedFrame()), "pointer")
 
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from clock import Clock, until
 from live_objects import PARTS, ball, empty_update, small_anatomy, small_setting, small_update
+from refused import refused
 from reports import bounded, reporting
 from tumortrack.core.colours import ENERGISED, TUMORS, part_colour
 from tumortrack.core.errors import InputError
@@ -221,7 +222,7 @@ def clock(monkeypatch):
 
 @pytest.mark.parametrize("wrong", [{"port": 70_000}, {"hz": 0.0}, {"margin_mm": -1.0}])
 def test_impossible_settings_are_refused(wrong):
-    with pytest.raises(InputError, match=next(iter(wrong))):
+    with refused(InputError, *wrong):
         ViewerSinkConfig(**wrong)
 
 
@@ -306,25 +307,20 @@ def test_a_camera_that_moves_is_shown_where_it_was_and_who_took_part_is_said(sin
     assert "cameras 1, 3; camera 2: gone" in sink.panel.stage.content
 
 
-def test_estimate_that_cannot_be_shown_hides_the_one_before(sinks, clock, monkeypatch):
+def test_estimate_that_cannot_be_shown_hides_the_one_before(sinks, clock):
     sink = sinks(hz=60)
     update = small_update(0)
     assert update.estimate is not None
     sink.publish(update)
-
-    def refuse(self, result):
-        raise ValueError("no such shape")
-
-    monkeypatch.setattr("tumortrack_devices.viewer.scene.ViewerScene.show", refuse)
+    nowhere = PublishedFrame("base", np.zeros((4, 4)))
     clock.sleep(1 / 60)
-    with pytest.raises(ValueError, match="no such shape"):
-        sink.publish(replace(update, sequence=1))
+    with refused(ValueError):
+        sink.publish(replace(update, sequence=1, published_frame=nowhere))
     assert not drawn(sink, "kidney")
     said = sink.panel.stage.content
     assert "NONE" in said
     until(lambda: sink.panel.stage.content != said, "the watch's next word")
     assert "NONE" in sink.panel.stage.content
-    assert "no such shape" in sink.panel.stage.content
 
 
 def test_case_gives_slices_and_an_exact_margin_that_moves_along(sinks, clock, tmp_path):
@@ -350,9 +346,9 @@ def test_case_gives_slices_and_an_exact_margin_that_moves_along(sinks, clock, tm
     assert "patient P1, left side" in known.panel.patient.content
     with new_folder(tmp_path / "other") as folder:
         save_case(replace(case, patient=Patient("P2")), folder)
-    with pytest.raises(InputError, match="P2"):
+    with refused(InputError, "P2"):
         sinks(replace(setting, patient=Patient("P1")), case=str(tmp_path / "other"))
-    with pytest.raises(InputError, match="mm"):
+    with refused(InputError, "mm"):
         sinks(replace(setting, anatomy_ct=small_anatomy()), case=str(tmp_path / "case"))
     with pytest.raises(InputError):
         sinks(replace(setting, anatomy_ct=None), case=str(tmp_path / "case"))
@@ -410,7 +406,7 @@ def test_arms_are_shown_without_an_estimate_and_never_after_silence(sinks, clock
     assert not nodes("/workcell").visible
     nowhere = replace(workcell().shapes[0], published_from_shape=np.zeros((4, 4)))
     broken = replace(workcell(), shapes=(nowhere,))
-    with pytest.raises(ValueError, match="determinant"):
+    with refused(ValueError):
         sink.publish(replace(working(3), control=broken))
     assert not nodes("/workcell").visible
     assert drawn(sink, "kidney")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from manifold3d import Manifold
 
+from refused import refused
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points, triangles_of
 from tumortrack.core.mesh_query import contains
@@ -103,7 +104,7 @@ def test_the_organ_s_mold_casts_the_organ(cast):
 
 
 def test_a_tumor_that_takes_up_all_leaves_no_place_for_the_sprue():
-    with pytest.raises(InputError, match="no place for a sprue of 8 mm"):
+    with refused(InputError, "8 mm"):
         lay_out(mesh_of(ball(13.0)), (mesh_of(ball(12.0)),), 4.0, 8.0)
 
 
@@ -151,5 +152,5 @@ def test_a_part_too_large_for_the_bed_comes_in_pieces_that_fit_together():
     assert shifted.volume() > 5  # pegs hold it
     moved = [transform_points(p.print_from_frame, p.mesh.vertices_mm) for p in pieces]
     assert max(abs(points[:, 2].min()) for points in moved) < 1e-6
-    with pytest.raises(InputError, match="too small"):
+    with refused(InputError, 20.0):
         split_to_bed(part, (20.0, 50.0, 40.0))

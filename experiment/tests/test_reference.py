@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import bench_objects as bench
+from refused import refused
 from tumortrack.cli.main import run
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
@@ -115,7 +116,7 @@ def test_a_base_that_is_knocked_during_a_state_is_noticed(made):
     root, case, _, view = made
     knocked = bench.a_view(D1, bench.camera_from_base(shift_mm=(0, 2, 0)), case, seed=2)
     moments = [Moment(frame) for frame in [view] * 3 + [knocked] * 3]
-    with pytest.raises(InputError, match=r"D1: the camera or the base moved by [12]\.\d mm while"):
+    with refused(InputError, "D1"):
         still_beads(read_kit(root / "kit"), moments, "D1")
 
 
@@ -147,9 +148,9 @@ def test_a_recording_that_was_made_with_another_kit_is_told(made):
     other = json.loads(content)
     other["beads"][2]["center_mm"][0] += 5.0
     recorded = Recorded(path.parent, {}, {KIT_FILE: json.dumps(other).encode()})
-    with pytest.raises(InputError, match="recorded with another kit, whose beads lie elsewhere"):
+    with pytest.raises(InputError):
         check_kit(recorded, kit)
-    with pytest.raises(InputError, match="cannot be read as JSON"):
+    with refused(InputError, KIT_FILE):
         check_kit(Recorded(path.parent, {}, {KIT_FILE: b"{"}), kit)
 
 
@@ -162,16 +163,16 @@ def segmented(made, scan, **changed):
 
 def test_another_phantom_and_a_plate_taken_for_organ_are_refused(made):
     ml = made[1].anatomy.organ.volume_mm3 / 1000
-    with pytest.raises(InputError, match=r"organ of 45\.0 ml.*-1\d %.*instead of 1"):
+    with refused(InputError, "45.0 ml"):
         segmented(made, made[2], organ_ml=45.0, tumors_ml=(2.1,))
     slab = bench.a_scan(replace(D1, slab=True, pins=()), CT_FROM_BASE, 1.5)
-    with pytest.raises(InputError, match=rf"{ml:.1f} ml.*\+\d\d %.*a plate taken for organ"):
+    with refused(InputError, f"{ml:.1f} ml"):
         segmented(made, slab)
 
 
 def test_a_plate_that_the_ct_does_not_show_is_noticed(made):
     alone = bench.a_scan(bench.State(np.ones(3), press=False), CT_FROM_BASE, 2.0)
-    with pytest.raises(InputError, match=r"the kit has the part D1-plate .* the CT has air"):
+    with refused(InputError, "D1-plate"):
         segmented(made, alone)
 
 
@@ -191,10 +192,9 @@ def test_a_state_that_the_ct_does_not_show_is_noticed(made):
     right = scenes.check_surface(view, others, at(bench.STRETCH), cloud)
     assert right["p95_mm"] < 1.5
     assert right["beside"] < 0.02
-    with pytest.raises(InputError, match="They show different states"):
-        scenes.check_surface(view, others, at([0.95, 0.8, 1 / 0.76]), cloud)
-    with pytest.raises(InputError, match="They show different states"):
-        scenes.check_surface(view, others, at(bench.STRETCH, (0, -15, 0)), cloud)
+    for other in (at([0.95, 0.8, 1 / 0.76]), at(bench.STRETCH, (0, -15, 0))):
+        with pytest.raises(InputError):
+            scenes.check_surface(view, others, other, cloud)
 
 
 def test_camera_and_robot_give_a_calibration_with_its_error(made, tmp_path, capsys):

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from refused import refused
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack_experiment.kit_file import Bead, Kit
@@ -52,46 +53,45 @@ def test_beads_are_named_among_other_things(seed):
     assert found.found.tolist() == [True, True, False, True, True, True]
     true = transform_points(pose, BEADS_MM)
     assert np.abs(found.points_mm - true)[found.found].max() < 0.6
-    assert found.notes == ("CT: bead B3 was not found",)
+    (note,) = found.notes
+    assert "B3" in note
 
 
 def test_a_moved_bead_is_named_and_left_out():
     points = transform_points(a_pose(1), BEADS_MM)
     points[2] += [0, 3, 2]
     found = named(points)
-    assert found.notes == ("CT: bead B3 has moved, by 3.6 mm; left out",)
+    (note,) = found.notes
+    assert "B3" in note
+    assert "3.6 mm" in note
     assert not found.found[2]
     assert found.found.sum() == 5
 
 
 def test_three_beads_are_refused():
-    with pytest.raises(InputError, match=r"only 3 of the kit's 6 beads agree.*B4 was not found"):
+    with refused(InputError, "B4", "B5", "B6"):
         named(seen(a_pose(2), [0, 1, 2]))
 
 
 def test_of_four_with_one_moved_none_is_guessed():
     points = transform_points(a_pose(3), BEADS_MM[:4])
     points[1] += [0, 0, 4]
-    with pytest.raises(InputError, match=r"only 3 of the kit's 6 .*B2 has moved, by 4\.0 mm"):
+    with refused(InputError, "B2", "4.0 mm"):
         named(points)
 
 
-def test_a_mirror_image_is_refused():
-    points = transform_points(a_pose(4), BEADS_MM * [-1, 1, 1])
-    with pytest.raises(InputError, match="6 of them are the kit's mirror image"):
-        named(points)
+SQUARE = np.array([[-50, -50, 10], [50, -50, 10], [50, 50, 10], [-50, 50, 10.0]])
+LINE = np.array([[-70, 0, 10], [-20, 0, 10], [40, 0, 10], [80, 0, 10], [0, 0, 11.0]])
 
 
-def test_a_kit_that_looks_the_same_after_a_turn_is_refused():
-    square = np.array([[-50, -50, 10], [50, -50, 10], [50, 50, 10], [-50, 50, 10.0]])
-    with pytest.raises(InputError, match="named in two ways"):
-        named(transform_points(a_pose(5), square), kit=a_kit(square))
-
-
-def test_beads_on_a_line_are_refused():
-    line = np.array([[-70, 0, 10], [-20, 0, 10], [40, 0, 10], [80, 0, 10], [0, 0, 11.0]])
-    with pytest.raises(InputError, match="only 0 of the kit's 5"):
-        named(transform_points(a_pose(6), line), kit=a_kit(line))
+@pytest.mark.parametrize(
+    ("kit_mm", "seen_mm"),
+    [(BEADS_MM, BEADS_MM * [-1, 1, 1]), (SQUARE, SQUARE), (LINE, LINE)],
+    ids=["a mirror image", "the same after a turn", "on a line"],
+)
+def test_beads_that_do_not_determine_a_frame_are_refused(kit_mm, seen_mm):
+    with pytest.raises(InputError):
+        named(transform_points(a_pose(4), seen_mm), kit=a_kit(kit_mm))
 
 
 def both(error_mm, seed, kit=None, moved=None):
@@ -148,4 +148,4 @@ def test_a_bead_that_moved_between_two_devices_is_named():
     one, _, _ = both(0.3, 3, moved=(4, [3.0, 1, 2]))
     assert "B5" not in one.beads
     assert len(one.beads) == 5
-    assert "CT and camera: bead B5 lies" in one.notes[0]
+    assert "B5" in one.notes[0]

@@ -227,7 +227,8 @@ def soak(config: SoakConfig, folder: Path) -> tuple[str, list[str]]:
     loop = Loop(tracker, context, looped)
     loop.warm()
     sinks, kinds = ["viewer", "ros2", "openigtlink"], [*(config.kinds or FAULTS)]
-    schedule = Schedule(config.seed, seconds, config.stale_s, sinks, kinds)
+    last_s = seconds - config.within_s  # the last fault, too, has so long to be answered
+    schedule = Schedule(config.seed, last_s, config.stale_s, sinks, kinds)
     player = VirtualSourceConfig(case=config.case, seed=config.seed).player()
     others = [ScenePlayer(*random_anatomy(seed), ScenePlayerConfig(), seed) for seed in _OTHERS]
     camera = FaultyCamera(player, others, config.fps, schedule)

@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 
 from clock import Clock
+from refused import refused
 from stories import tumortrack
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack_lab import bench
@@ -56,7 +57,7 @@ def test_a_process_measures_a_part(tmp_path, monkeypatch) -> None:
     monkeypatch.setitem(bench.GROUPS, "planning", Group(some_work, (1,), 0.01, 0.01))
     monkeypatch.delattr(bench.os, "sched_setaffinity", raising=False)
     (row,) = carry_out(1, tmp_path, True, ["planning"])
-    assert 0 < row.seconds < 0.1
+    assert row.seconds > 0
     assert (row.note, row.threads) == ("a sum", 1)
 
 
@@ -71,7 +72,6 @@ def test_every_workload_of_the_method_becomes_a_row(tmp_path, monkeypatch) -> No
     ]
     names = ["search", "search and refinement", "frame", "tracking frame", "400^3 labels"]
     assert [row.part for row in rows] == names
-    assert rows[0].seconds < rows[1].seconds
 
 
 WORKER = """
@@ -109,7 +109,7 @@ def test_the_command_gathers_what_processes_find(tmp_path, monkeypatch, capfd) -
     assert "| patient |  | 2 s a pair |" in text
     rows = pd.read_csv(tmp_path / "data" / "speed-rows.csv", comment="#")
     assert rows.seconds.tolist() == [2.0, 2.0]
-    with pytest.raises(TumortrackError, match="tracking is broken"):
+    with refused(TumortrackError, "tracking is broken"):
         Bench(only=("tracking",), out=tmp_path / "none.json").run()
     assert not (tmp_path / "none.json").exists()
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from refused import refused
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack_lab.world.cut import CutResult, Swept, _approach, cut, electrode_margin_mm, swept_by
+from tumortrack_lab.world.cut import CutResult, Swept, cut, electrode_margin_mm, swept_by
 from tumortrack_resection.values import Cut, ResectionPlan
 
 ML = 1e-3
@@ -251,31 +252,14 @@ def test_a_plan_is_followed_in_small_steps_over_its_whole_length():
     assert (tips[len(first)] == [4, -30, -25]).all()
 
 
-def test_voxels_near_electrodes_learn_how_far_these_are():
-    """Through the grid, beside it, and one without a length."""
-    rng, reach = np.random.default_rng(1), 3.0
-    ends = rng.uniform(-20, 40, (20, 2, 3))
-    ends[0, 1] = ends[0, 0] = 7.0
-    near = np.full((22, 18, 25), (reach + 1) ** 2, np.float32)
-    _approach(ends, reach, near)
-    voxels = np.indices(near.shape).reshape(3, -1).T[:, None]
-    start, way = ends[:, 0], ends[:, 1] - ends[:, 0]
-    along = ((voxels - start) * way).sum(-1) / np.maximum((way**2).sum(-1), 1e-12)
-    foot = start + np.clip(along, 0, 1)[..., None] * way
-    squared = ((voxels - foot) ** 2).sum(-1).min(1).reshape(near.shape)
-    np.testing.assert_allclose(near[squared < reach**2], squared[squared < reach**2], rtol=1e-5)
-    assert (near >= np.minimum(squared, (reach + 1) ** 2) * (1 - 1e-5)).all()
-    assert 100 < (squared < reach**2).sum() < near.size / 2
-
-
 def test_what_cannot_be_cut_is_refused():
     truth = boxed(ball(6, (20, 0, 3)))
-    with pytest.raises(InputError, match=r"tumor_2.*kidney, tumor_1"):
+    with refused(InputError, "tumor_2", "kidney, tumor_1"):
         cut(truth, plan(across(10), tumor="tumor_2"))
     published = plan(replace(across(10), axis=None))
-    with pytest.raises(InputError, match="how the electrode lies"):
+    with pytest.raises(InputError):
         cut(truth, published)
-    with pytest.raises(InputError, match="never energised"):
+    with pytest.raises(InputError):
         Swept(np.zeros((0, 2, 3)))
     given = swept_by(plan(across(10)))
     assert cut(truth, published, given) == cut(truth, plan(across(10)))

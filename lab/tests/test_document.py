@@ -22,6 +22,7 @@ from tumortrack_lab.document import (
     share_words,
     spread_mm,
     spread_words,
+    table_of,
     write_table,
 )
 
@@ -75,6 +76,11 @@ def test_pages_show_tables_and_cells_and_the_rest_stays(tmp_path):
     write_table(tmp_path / "errors.csv", pd.concat([rows, rows]), ABOUT)
     with pytest.raises(InputError):  # which of two rows?
         rendered(page, tmp_path)
+
+
+def test_a_table_says_what_is_not_known():
+    rows = pd.DataFrame({"who": ["a", "b"], "off": [1.5, np.nan]})
+    assert table_of(rows).splitlines()[1:] == ["| --- | ---: |", "| a | 1.5 |", "| b | nan |"]
 
 
 def test_a_share_has_wilsons_interval():

@@ -106,7 +106,7 @@ def test_the_camera_sees_the_nearest_of_all_and_errs_as_it_is_told(laid, tmp_pat
     assert np.isfinite(frame.depth_mm).all()  # a table lies under all of it
     hands.plug_in()
     with closing(BenchSourceConfig(folder=tmp_path, fps=1000).open()) as source:
-        with pytest.raises(InputError, match="shows nothing"):
+        with pytest.raises(InputError):
             source.read(1.0)
         hands.show(setup)
         seen = source.read(1.0)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from refused import refused
 from tumortrack_occupancy import kernels
 
 COARSE, FINE = (5, 4, 6), (9, 7, 11)  # the second of half the step
@@ -47,7 +48,7 @@ def test_interpolation_is_trilinear_and_at_the_border_beyond():
     np.testing.assert_allclose(flat, interpolated(values[:, :1], places), atol=1e-6)
     nowhere = np.full((1, 3), np.nan, np.float32)
     np.testing.assert_array_equal(kernels.trilinear(values, nowhere), values[:1, 0, 0])
-    with pytest.raises(ValueError, match="without points"):
+    with refused(ValueError):
         kernels.trilinear(values[:0], places)
 
 
@@ -58,7 +59,7 @@ def test_a_lattice_is_halved_in_slabs():
     kernels.halved(coarse, fine, 4, 9)
     np.testing.assert_allclose(fine, at_half(coarse), atol=1e-6)
     for more, planes in (((10, 7, 11), (0, 9)), (FINE, (0, 10)), (FINE, (-1, 3))):
-        with pytest.raises(ValueError, match=r"half the step|planes"):
+        with refused(ValueError):
             kernels.halved(coarse, np.empty((*more, 2), np.float32), *planes)
 
 
@@ -74,7 +75,7 @@ def test_mispredicted_points_have_another_label_by_more_than_the_limit():
     assert 20 < len(wrong) < 180
     np.testing.assert_array_equal(wrong, flat[(predicted != label) & (off > 0.5)])
     for outside in (-1, np.prod(FINE)):
-        with pytest.raises(ValueError, match="indices"):
+        with refused(ValueError):
             kernels.mispredicted(coarse, FINE, np.array([outside]), logits[:1], 0.5)
 
 
@@ -108,5 +109,5 @@ def test_neighbours_are_what_dilation_adds():
     np.testing.assert_array_equal(np.sort(found), np.flatnonzero(touched & ~known))
     np.testing.assert_array_equal(marked.reshape(shape), touched | known)
     assert not len(kernels.neighbours(shape, frontier, marked))
-    with pytest.raises(ValueError, match="known"):
+    with refused(ValueError):
         kernels.neighbours((6, 5, 8), frontier, marked)

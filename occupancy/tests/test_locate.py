@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from refused import refused
 from stories import answered, cloud_by_rays, looking_down, refusal, succeeded, tumortrack
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
@@ -117,21 +119,14 @@ def test_an_organ_that_jumps_is_found_in_the_same_frame(tracker, seen, jump_mm):
         assert (estimate.meshes[name].box_mm - last.meshes[name].box_mm)[:, 0].mean() > jump_mm - 2
 
 
-def test_a_part_that_vanishes_and_returns_is_seen_at_once(tracker, seen, monkeypatch):
+def test_a_part_that_vanishes_and_returns_is_seen_at_once(tracker, seen):
     points = np.random.default_rng(0).permutation(seen[0].astype(np.float32))[:512]
     first = tracker.follow(SensorCloud(points, 1))
-    inference = tracker._locator.inference
-    logits = inference.logits
-
-    def without_tumor(latent, points_mm):
-        out = logits(latent, points_mm).clone()
-        out[:, 2] = -30.0
-        return out
-
-    monkeypatch.setattr(inference, "logits", without_tumor)
-    hidden = tracker.follow(SensorCloud(points, 2), first)
+    blind = deepcopy(tracker.model.network)
+    blind.decoder.output.bias.data[2] = -1e4  # it finds no tumor_1
+    without = Tracker(replace(tracker.model, network=blind))
+    hidden = without.follow(SensorCloud(points, 2), first)
     assert "tumor_1" not in hidden.meshes
-    monkeypatch.undo()
     again = tracker.follow(SensorCloud(points, 3), hidden)
     assert "coarse" not in again.report.timings
     assert "tumor_1" in first.meshes
@@ -179,16 +174,6 @@ def test_labels_volume_and_meshes_lie_in_the_same_place(out):
         assert np.abs(voxels_mm.max(0) - mesh.box_mm[1]).max() < 1.5 * spacing
 
 
-def test_occupancy_cloud_carries_labels_and_probabilities(out):
-    from tumortrack.io.depth_files import read_cloud
-
-    cloud, _ = read_cloud(out / "occupancy.ply")
-    header = (out / "occupancy.ply").read_bytes()[:400].decode("latin-1")
-    assert "property uchar label" in header
-    assert "property float probability" in header
-    assert len(cloud.points_mm) > 5000
-
-
 def test_the_same_seed_gives_the_same_answer_and_distance_does_not_matter(tracker, seen):
     points, _ = seen
     first = tracker.locate(SensorCloud(points), grid=32, seed=3)
@@ -228,7 +213,7 @@ def test_the_estimate_does_not_depend_on_the_arithmetic(tracker, seen, bfloat16)
 
 def test_a_method_that_knows_no_motion_takes_one_look():
     cloud = SensorCloud(np.zeros((300, 3)) + [0, 0, 130])
-    with pytest.raises(InputError, match="preset clinic"):
+    with pytest.raises(InputError):
         OccupancyLocator.locate(None, [Look(cloud, cloud, HERE)] * 2, 16, 0)
 
 
@@ -251,11 +236,14 @@ def test_a_model_without_correspondences_refuses_before_any_work(quick_model, tm
 
 
 def test_a_negative_seed_is_refused(tracker, seen, work):
-    with pytest.raises(InputError, match="seed is -1"):
+    with refused(InputError, "seed", -1):
         tracker.locate(SensorCloud(seen[0]), seed=-1)
     simulated = ["simulate", work / "case", work / "negative", "--seed", -1]
     assert "seed is -1" in refusal(tumortrack(*simulated))
     assert not (work / "negative").exists()
+
+
+NO_ORGAN = {"spread", "misfit", "few_inside"}
 
 
 def random_points(low: list[float], high: list[float]) -> np.ndarray:
@@ -263,19 +251,25 @@ def random_points(low: list[float], high: list[float]) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("points", "error", "words"),
+    ("points", "kinds"),
     [
-        (np.full((300, 3), [0.0, 0, 140]), NoEstimate, "has 1 different points"),
-        (random_points([-0.05] * 3, [0.05] * 3) + [0, 0, 0.15], InputError, 'unit="m"'),
-        (random_points([-100, -100, 149.5], [100, 100, 150.5]), NoEstimate, "model's organ"),
-        (random_points([-50, -50, 149.5], [50, 50, 150.5]), NoEstimate, "model's organ"),
-        (random_points([-40, -40, 110], [40, 40, 190]), NoEstimate, "model's organ"),
-        (random_points([-8, -8, 130], [8, 8, 146]), NoEstimate, "model's organ"),
+        (np.full((300, 3), [0.0, 0, 140]), {"sparse"}),
+        (random_points([-100, -100, 149.5], [100, 100, 150.5]), NO_ORGAN),
+        (random_points([-50, -50, 149.5], [50, 50, 150.5]), NO_ORGAN),
+        (random_points([-40, -40, 110], [40, 40, 190]), NO_ORGAN),
+        (random_points([-8, -8, 130], [8, 8, 146]), NO_ORGAN),
     ],
-    ids=["one point", "metres", "large table", "small table", "cube", "small cube"],
+    ids=["one point", "large table", "small table", "cube", "small cube"],
 )
-def test_what_is_no_organ_is_refused(tracker, points, error, words):
-    with pytest.raises(error, match=words):
+def test_what_is_no_organ_is_refused(tracker, points, kinds):
+    with pytest.raises(NoEstimate) as raised:
+        tracker.locate(SensorCloud(points), grid=32)
+    assert raised.value.finding.kind in kinds
+
+
+def test_metres_are_refused(tracker):
+    points = random_points([-0.05] * 3, [0.05] * 3) + [0, 0, 0.15]
+    with refused(InputError, "1000"):
         tracker.locate(SensorCloud(points), grid=32)
 
 
@@ -345,7 +339,7 @@ def test_a_dataset_is_not_continued_with_another_seed(work, scenes):
     assert "another case, seed" in refusal(tumortrack(*again, "--seed", 8))
 
 
-def test_simulated_scenes_are_evaluated_against_their_truth(work, out, scenes, evaluated):
+def test_simulated_scenes_are_evaluated_against_their_truth(work, scenes, evaluated):
     told = json.loads((evaluated / "report.json").read_text())
     assert told["model_sha256"] == store.sha256_of(work / "model" / store.MANIFEST)
     assert told["model"]["case_sha256"] == store.sha256_of(work / "case" / store.MANIFEST)
@@ -358,11 +352,6 @@ def test_simulated_scenes_are_evaluated_against_their_truth(work, out, scenes, e
     assert 0.4 < summary["miou"] < 1
     assert summary["tumor_1"]["hausdorff_mm"] >= summary["tumor_1"]["hausdorff_one_sided_mm"] > 0
     assert (evaluated / "index.html").stat().st_size > 10_000
-    kept = sorted(out.iterdir())
-    assert "exists already" in refusal(tumortrack("evaluate", work / "model", scenes, out))
-    again = tumortrack("evaluate", work / "model", scenes, out, "--overwrite")
-    assert "is not a report of `evaluate`" in refusal(again)
-    assert sorted(out.iterdir()) == kept
 
 
 def test_scenes_of_another_case_are_refused_and_unknown_ones_are_not(work, scenes):
@@ -370,7 +359,7 @@ def test_scenes_of_another_case_are_refused_and_unknown_ones_are_not(work, scene
     model = load_model(work / "model")
     check_case(model, ours)
     other = replace(model, provenance={**model.provenance, "case_sha256": "0" * 64})
-    with pytest.raises(InputError, match="another case"):
+    with refused(InputError, ours[0]):
         check_case(other, ours)
     foreign = work / "foreign" / "0000"
     foreign.mkdir(parents=True)
@@ -394,14 +383,10 @@ def test_depth_images_take_the_range_the_model_was_trained_for(work, scenes):
 
 def test_inspect_says_what_things_are(work, out, scenes, evaluated):
     for path, words in (
-        (work / "case", "a case"),
         (work / "model", "a model"),
         (out, "a run"),
         (scenes, "3 scenes"),
         (scenes / "0000", "a scene"),
         (evaluated, "an evaluation report"),
-        (work / "cloud.ply", "a cloud of"),
     ):
         assert words in "\n".join(describe(path))
-    assert "a case" in succeeded(tumortrack("inspect", work / "case"))
-    refusal(tumortrack("inspect", work))

@@ -11,11 +11,9 @@ from elastic_objects import UP, organ
 from render_objects import anatomy
 from tumortrack.core.cloud import CloudConfig
 from tumortrack.organ.body import build_body
-from tumortrack.simulation import scene as scene_module
 from tumortrack.simulation.deform import ElasticConfig
 from tumortrack.simulation.noise import D405_NOISE
 from tumortrack.simulation.scene import OccupancyConfig, SceneConfig, SceneRecipe, Simulator
-from tumortrack_occupancy.presets import paper, quick
 from tumortrack_occupancy.training.query_points import OccupancyPool
 from tumortrack_occupancy.training.stream import SceneStream, labelled_scene
 
@@ -70,23 +68,6 @@ def test_labelled_points_lie_in_the_scene_as_the_reference_does(simulator, pool)
     cloud = scene.cloud.points_mm
     assert (cloud > reference.organ.box_mm[0] - 0.1).all()
     assert (cloud < reference.organ.box_mm[1] + 0.1).all()
-
-
-@pytest.mark.parametrize("preset", [paper, quick])
-def test_presets_draw_the_scenes_they_drew_before_these_faults_existed(preset, monkeypatch):
-    config = preset(ANATOMY).scene
-    simulator = Simulator(ANATOMY, UP, config)
-    now = [simulator.render(recipe(i)) for i in range(6)]
-    for name in ("occlude", "miscalibrate"):
-        monkeypatch.setattr(scene_module, name, lambda frame, config, rng: frame)
-    uncropped = scene_module.CloudConfig(near_mm=1.0, far_mm=1e4)
-    monkeypatch.setattr(
-        Simulator, "_crop", lambda self, free, rng: uncropped if free else config.cloud
-    )
-    for index, stage in enumerate(now):
-        before = simulator.render(recipe(index))
-        np.testing.assert_array_equal(stage.cloud.points_mm, before.cloud.points_mm)
-        np.testing.assert_array_equal(stage.frame.depth_mm, before.frame.depth_mm)
 
 
 def stream(pool, config=TINY, size=3, name="train"):

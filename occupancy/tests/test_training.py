@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 import torch
 
-from clock import Clock, until
+from clock import PATIENCE_S, Clock, until
+from refused import refused
 from stories import COMMAND, STEPS, environment, refusal, succeeded, train_command, tumortrack
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import ArtifactError, InputError
@@ -59,11 +60,8 @@ def kill_at_first_checkpoint(command: list[object], model: Path) -> None:
         cwd=Path(__file__).parents[2] / "tests" / "support",  # whose files import each other
     ) as process:
         checkpoint = model / "training" / "checkpoint.safetensors"
-        deadline = time.monotonic() + 300
-        while not checkpoint.exists() and time.monotonic() < deadline:
-            time.sleep(0.005)
+        until(checkpoint.exists, "a checkpoint", 5 * PATIENCE_S)
         process.send_signal(signal.SIGKILL)
-    assert checkpoint.exists()
     assert not (model / "manifest.json").exists(), "the run ended before it was killed"
 
 
@@ -177,13 +175,13 @@ def test_a_changed_weights_file_or_schema_is_refused(quick_model, tmp_path):
     shutil.copytree(quick_model, model)
     manifest = json.loads((model / "manifest.json").read_text())
     (model / "manifest.json").write_text(json.dumps({**manifest, "schema": 999}))
-    with pytest.raises(ArtifactError, match="schema 999"):
+    with refused(ArtifactError, 999):
         load_model(model)
     (model / "manifest.json").write_text(json.dumps(manifest))
     weights = bytearray((model / "weights.safetensors").read_bytes())
     weights[-1] ^= 1
     (model / "weights.safetensors").write_bytes(weights)
-    with pytest.raises(ArtifactError, match="changed after it was written"):
+    with refused(ArtifactError, "weights.safetensors"):
         load_model(model)
 
 
@@ -252,18 +250,18 @@ def a_run(case: Path, **changes: object) -> TrainingRun:
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("changes", "option"),
     [
-        ({"seed": -1}, "seed is -1"),
-        ({"checkpoint_every_s": float("nan")}, "checkpoint_every_s= is nan"),
-        ({"checkpoint_every_s": -1.0}, "checkpoint_every_s= is -1"),
-        ({"minutes": float("nan")}, "minutes is nan"),
-        ({"workers": -1}, "workers is -1"),
-        ({"steps": 0}, "steps is 0"),
+        ({"seed": -1}, "seed"),
+        ({"checkpoint_every_s": float("nan")}, "checkpoint_every_s"),
+        ({"checkpoint_every_s": -1}, "checkpoint_every_s"),
+        ({"minutes": float("nan")}, "minutes"),
+        ({"workers": -1}, "workers"),
+        ({"steps": 0}, "steps"),
     ],
 )
-def test_impossible_runs_are_refused(case, changes, words):
-    with pytest.raises(InputError, match=words):
+def test_impossible_runs_are_refused(case, changes, option):
+    with refused(InputError, option, *changes.values()):
         a_run(case, **changes)
 
 
@@ -274,7 +272,7 @@ def test_a_refused_run_leaves_nothing_behind(case, tmp_path):
     needle = run.anatomy_ct.organ.vertices_mm.mean(0) + run.anatomy_ct.tumors[0].vertices_mm * 1e-4
     needle[:, 0] *= 1e-3
     thin = Anatomy((run.anatomy_ct.organ, run.anatomy_ct.tumors[0].moved(needle)))
-    with pytest.raises(InputError, match="points"):
+    with pytest.raises(InputError):
         train(replace(run, anatomy_ct=thin), tmp_path / "model", lambda _: None)
     assert not (tmp_path / "model").exists()
 
@@ -283,7 +281,7 @@ def test_two_trainings_in_one_folder_are_refused_and_a_dead_ones_lock_is_not(tmp
     model = tmp_path / "model"
     with work_folder(model) as work:
         (work / "something").touch()
-        with pytest.raises(InputError, match="another process is training"), work_folder(model):
+        with refused(InputError, model), work_folder(model):
             pass
     assert (work / "something").exists()
     hold = (
@@ -304,7 +302,7 @@ def test_a_diverged_run_stops_and_keeps_the_checkpoint_before(case, tmp_path):
     state.save(tmp_path)
     before = (tmp_path / "checkpoint.safetensors").read_bytes()
     clouds, points, labels = batch
-    with pytest.raises(Diverged, match="diverged at step 1"):
+    with refused(Diverged, "step 1"):
         state.step((clouds, points * float("inf"), labels))
     with torch.no_grad():
         next(iter(state.network.parameters())).fill_(float("nan"))
@@ -371,7 +369,8 @@ def test_presets_survive_json_and_refuse_unknown_keys(case):
         config = preset(anatomy)
         data = to_builtins(config)
         assert from_builtins(data, TrainConfig, "here") == config
-        with pytest.raises(InputError, match="unknown"):
+        assert config.scene.occlusion.scenes == config.scene.calibration.scale == 0
+        with refused(InputError, "learning_rte"):
             from_builtins({**data, "learning_rte": 1}, TrainConfig, "here")
     assert paper(anatomy).steps == 155_000
     assert paper(anatomy).scene.clutter.scenes == 0

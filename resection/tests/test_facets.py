@@ -20,6 +20,7 @@ from plan_objects import (
     sphere,
     united,
 )
+from refused import refused
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import Mesh
@@ -183,7 +184,7 @@ def test_an_electrode_that_is_too_short_is_refused_and_one_that_is_long_enough_i
     enough = plan_resection(scene("side"), OURS, Tools(electrode_mm=float(deepest + 12)))
     for cut in enough.cuts:
         assert not contains(scene("side").organ, swept(cut, deepest + 12 - 4)[:, 1]).any()
-    with pytest.raises(NoPlan, match=r"electrode of 15 mm"):
+    with refused(NoPlan, "15 mm"):
         plan_resection(scene("side"), OURS, Tools(electrode_mm=15.0))
 
 
@@ -234,7 +235,7 @@ def test_the_first_tumor_keeps_the_distance_that_is_asked_for_when_the_second_is
     plan = plan_resection(scene("a second tumor"), both)
     assert (plan.tumor, plan.keep_mm) == ("tumor_2", {"tumor_1": 3.0})
     assert gap_mm(plan, scene("a second tumor").meshes["tumor_1"]) > 3.0 - 0.1
-    with pytest.raises(InputError, match='keep_away="tumor_1"'):
+    with refused(InputError, 'keep_away="tumor_1"'):
         plan_resection(scene("side"), ResectionConfig(keep_away={"tumor_1": 3.0}))
 
 
@@ -271,7 +272,7 @@ def test_cuts_keep_the_distance_from_a_structure(off_mm, keep_mm):
 
 def test_a_structure_round_the_tumor_is_no_plan_by_its_name():
     seen = replace(located(n=12_000), structures={"vein": sphere(TUMOR_MM, RADIUS_MM + 5.0)})
-    with pytest.raises(NoPlan, match="vein"):
+    with refused(NoPlan, "vein"):
         plan_resection(seen, ResectionConfig(keep_away={"vein": 3.0}))
 
 
@@ -285,12 +286,12 @@ def test_an_open_structure_keeps_its_distance_too():
 
 
 def test_what_cannot_be_kept_away_from_is_refused():
-    with pytest.raises(InputError, match=r"keep_away= ?vein.* artery"):
+    with refused(InputError, "vein", "artery"):
         plan_resection(with_artery(2.0), ResectionConfig(keep_away={"vein": 3.0}))
-    with pytest.raises(InputError, match='keep_away="tumor_2"'):
+    with refused(InputError, 'keep_away="tumor_2"'):
         plan_resection(with_artery(2.0), ResectionConfig(keep_away={"tumor_2": 3.0}))
     for mm in (0.0, -1.0, 51.0, float("nan")):
-        with pytest.raises(InputError, match="keep_away"):
+        with refused(InputError, "keep_away"):
             ResectionConfig(keep_away={"artery": mm})
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from live_objects import small_estimate, small_update
 from plan_objects import Deviating, located, sphere
+from refused import refused
 from reports import reporting
 from stories import answered, succeeded, tumortrack
 from tumortrack.core import store
@@ -217,7 +218,7 @@ def test_arms_are_planned_to_pull_and_a_plan_without_its_pull_is_refused(taut, t
     write_plan(tmp_path / "plan", content, {}, lambda folder: None)
     assert [s.name for s in read_plan(tmp_path / "plan").motions.stages] == list(named)
     still = replace(content, cell=msgspec.structs.replace(config, pull_mm=0.0))
-    with pytest.raises(NoPlan, match="its stages are approach, grasp, hold, pull"):
+    with refused(NoPlan, "approach, grasp, hold, pull"):
         write_plan(tmp_path / "still", still, {}, lambda folder: None)
 
 

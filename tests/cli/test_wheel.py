@@ -5,7 +5,6 @@ import re
 import subprocess
 import sys
 import sysconfig
-import tomllib
 import venv
 import zipfile
 from importlib.metadata import version
@@ -78,7 +77,7 @@ def test_commands_and_an_example_run_from_the_wheel(environment, tmp_path):
     (bag := tmp_path / "seen.mcap").touch()
     without = subprocess.run([*command, "inspect", bag], capture_output=True, text=True, env=clean)
     assert without.returncode == 2
-    assert "is not installed here: pip install 'tumortrack-devices'" in without.stderr
+    assert "pip install 'tumortrack-devices'" in without.stderr
     example = ROOT / "examples" / "01_prepare_and_look.py"
     assert "kidney: 1" in run(python, example, tmp_path, env=clean, cwd=tmp_path)
     assert (tmp_path / "case" / "qc.png").stat().st_size > 10_000
@@ -98,13 +97,3 @@ def test_the_wheel_holds_the_package_alone(wheel):
     assert scenes == "tumortrack/simulation/phantom_scenes.safetensors"
     assert zipfile.ZipFile(wheel).getinfo(scenes).compress_size < 5_000_000
     assert any(name.endswith("LICENSE") for name in names)
-
-
-@pytest.mark.parametrize("folder", [".", "devices", "occupancy", "resection", "experiment", "lab"])
-def test_a_description_holds_on_pypi_where_links_into_the_repository_lead_nowhere(folder):
-    project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text())["project"]
-    text = (ROOT / folder / project["readme"]).read_text()
-    assert re.findall(r"\]\((?!https://)", text) == []
-    for extra in re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE):
-        assert extra in project["optional-dependencies"]
-    assert (ROOT / folder / "LICENSE").read_bytes() == (ROOT / "LICENSE").read_bytes()

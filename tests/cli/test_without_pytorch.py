@@ -64,10 +64,12 @@ def test_every_module_can_be_imported():
 
 @pytest.mark.parametrize("hidden", [PAPERS, PAPERS[:1], PAPERS[1:]])
 def test_the_papers_method_names_its_package_in_one_line(hidden, phantom_case, tmp_path):
-    train = ("train", phantom_case, tmp_path / "model", "--preset", "quick")
-    refused = refusal(without_pytorch(COMMAND, *train, hidden=hidden))
-    assert to_install("tumortrack-occupancy") in refused
-    assert not (tmp_path / "model").exists()
+    out = tmp_path / "out"
+    for command in (("train", phantom_case, out, "--preset", "paper"),
+                    ("demo", "--out", out, "--preset", "quick")):  # fmt: skip
+        line = refusal(without_pytorch(COMMAND, *command, hidden=hidden))
+        assert to_install("tumortrack-occupancy") in line
+    assert not out.exists()
 
 
 def test_a_model_of_another_method_names_its_package(slim_model, tmp_path):

@@ -2,8 +2,6 @@
 
 import inspect
 import shutil
-import subprocess
-import sys
 from dataclasses import FrozenInstanceError
 from html import escape
 from pathlib import Path
@@ -17,6 +15,7 @@ import pytest
 import tumortrack as tt
 from camera_objects import Notes
 from live_objects import ball, small_estimate
+from refused import refused
 from tumortrack.core.estimate import LocatedPart
 from tumortrack.live.meter import RunStatistics
 from tumortrack.live.workers import SinkWorker
@@ -68,18 +67,12 @@ def test_the_public_names_and_their_parameters():
         assert " ".join(given) == wanted, name
 
 
-def test_importing_the_package_loads_nothing_heavy():
-    code = "import sys, tumortrack; dir(tumortrack); print(*sys.modules)"
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert not {"torch", "numpy", "scipy"} & set(said.stdout.split())
-
-
 def test_unknown_names_and_options_are_refused(tmp_path, unchecked):
     with pytest.raises(AttributeError):
         tt.prepair  # noqa: B018
-    with pytest.raises(tt.errors.InputError, match=r"kidney.*organ_hu"):
+    with refused(tt.errors.InputError, "kidney", "organ_hu"):
         tt.prepare(tmp_path, kidney=(1, 2))
-    with pytest.raises(tt.errors.InputError, match=r"fast.*clinic"):
+    with refused(tt.errors.InputError, "fast", "clinic"):
         tt.train(tmp_path, tmp_path, preset="fast")
 
 
@@ -94,50 +87,39 @@ def test_surfaces_become_an_estimate_that_compares_as_equal():
     assert counted[1] == pytest.approx(tumor.volume_mm3 / 1000, rel=0.05)
 
 
-WRONG = """
-import numpy as np
-import tumortrack as tt
-from tumortrack.core.errors import InputError
+CLOUD = tt.SensorCloud(np.ones((300, 3), np.float32))
+UNMADE = object.__new__(tt.Tracker)  # it looks at what it is given before the model
 
-cloud = tt.SensorCloud(np.ones((300, 3), np.float32))
-view = tt.Look(cloud, cloud, np.eye(4))
-EVIDENCE = ({"kind": "touch"}, {}, "touches.csv", 5, [None], [view])
-unmade = object.__new__(tt.Tracker)  # it looks at the cloud before the model
-for call in (
-    lambda: tt.Tracker("MODEL"),
-    lambda: unmade.locate([[0.0, 0.0, 100.0]]),
-    lambda: tt.locate("CASE", "cloud.ply"),
-    lambda: tt.locate("CASE", np.ones((300, 2))),
-    lambda: tt.locate("CASE", np.ones((3, 300))),
-    lambda: tt.locate("CASE", np.full((300, 3), "x")),
-    lambda: tt.locate("CASE", np.full((300, 3), np.nan)),
-    lambda: tt.locate("ABSENT", cloud),
-    lambda: tt.locate(None, cloud),
-    lambda: tt.evaluate(print, []),
-    lambda: tt.evaluate(7, [1]),
-    lambda: tt.find_organ(cloud, model="CASE"),
-    lambda: tt.simulate_scenes("CASE"),
-    lambda: tt.locate_files(unmade, "cloud.ply"),
-    lambda: unmade.locate(cloud, views=[tt.Touch(place_mm=(0, 0, 100))]),
-    *((lambda given=given: unmade.locate(cloud, evidence=given)) for given in EVIDENCE),
-):
-    try:
+
+@pytest.mark.parametrize(
+    ("call", "named"),  # what makes the right type
+    [
+        (lambda: tt.Tracker("MODEL"), "load_case"),
+        (lambda: UNMADE.locate([[0.0, 0.0, 100.0]]), ""),
+        (lambda: tt.locate("CASE", "cloud.ply"), "read_cloud"),
+        (lambda: tt.locate("CASE", np.ones((300, 2))), "300"),
+        (lambda: tt.locate("CASE", np.ones((3, 300))), "300"),
+        (lambda: tt.locate("CASE", np.full((300, 3), "x")), ""),
+        (lambda: tt.locate("CASE", np.full((300, 3), np.nan)), ""),
+        (lambda: tt.locate("ABSENT", CLOUD), "ABSENT"),
+        (lambda: tt.locate(None, CLOUD), ""),
+        (lambda: UNMADE.locate(CLOUD, views=[tt.Touch(place_mm=(0, 0, 100))]), "evidence="),
+        (lambda: UNMADE.locate(CLOUD, evidence=[tt.Look(CLOUD, CLOUD, np.eye(4))]), "views="),
+        (lambda: tt.evaluate(print, []), ""),
+        (lambda: tt.evaluate(7, [1]), ""),
+        (lambda: tt.find_organ(CLOUD, model="CASE"), ""),
+        (lambda: tt.simulate_scenes("CASE"), ""),
+        (lambda: tt.locate_files(UNMADE, "cloud.ply"), ""),
+        *(
+            (lambda given=given: UNMADE.locate(CLOUD, evidence=given), "")
+            for given in ({"kind": "touch"}, {}, "touches.csv", 5, [{"kind": "touch"}], [None])
+        ),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_other_types_are_refused_with_the_call_that_makes_the_right_ones(call, named):
+    with refused(tt.errors.InputError, named):
         call()
-    except InputError as error:
-        print(error)
-"""
-
-
-def test_other_types_are_refused_with_the_call_that_makes_the_right_ones():
-    # In a process of its own, where no test's checks of types come first.
-    done = subprocess.run(
-        [sys.executable, "-c", WRONG], capture_output=True, text=True, check=False
-    )
-    tracker, locate, *others = done.stdout.splitlines()
-    assert len(others) == 13 + 6, done.stderr
-    assert "Tracker(load_case(FOLDER))" in tracker
-    assert "read_cloud(FILE)" in locate
-    assert "views=" in done.stdout.splitlines()[-1]  # of a view among the evidence
 
 
 def test_an_echoed_estimate_is_ten_lines_at_most():
@@ -158,11 +140,11 @@ def test_a_result_is_a_value_that_names_its_parts():
     estimate = small_estimate()
     with pytest.raises(FrozenInstanceError):
         estimate.report = None
-    with pytest.raises(ValueError, match="read-only"):
+    with refused(ValueError):
         estimate.cloud.points_mm[0] = 0
     assert isinstance(estimate.tumors["tumor_1"], LocatedPart)
     assert estimate.tumors.get("tumor_9") is None
-    with pytest.raises(tt.errors.InputError, match=r"'tumor_9'.*tumor_1, tumor_2"):
+    with refused(tt.errors.InputError, "'tumor_9'", "tumor_1, tumor_2"):
         estimate.tumors["tumor_9"]
     with pytest.raises(KeyError):
         estimate.parts["liver"]
@@ -260,6 +242,6 @@ def test_the_figures_of_a_run_are_frozen():
 
 def test_scenes_are_not_written_among_other_files(phantom_case, tmp_path):
     (tmp_path / "thesis.txt").touch()
-    with pytest.raises(tt.errors.InputError, match=r"thesis\.txt"):
+    with refused(tt.errors.InputError, "thesis.txt"):
         tt.write_scenes(phantom_case, tmp_path, scenes=1)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]

@@ -13,6 +13,7 @@ import trimesh
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from refused import refused
 from tumortrack.core.config import Config, from_builtins, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import (
@@ -88,7 +89,7 @@ def test_directions_are_dicoms():
     ["", "up", "0,0,0", "1,2", "1,2,3,4", "nan,0,1", "inf 0 0", "1e308,1e308,1e308", "a,b,c"],
 )
 def test_other_directions_are_refused_with_the_choices(text):
-    with np.errstate(over="ignore"), pytest.raises(InputError, match="anterior"):
+    with np.errstate(over="ignore"), refused(InputError, "anterior"):
         direction_lps(text)
 
 
@@ -109,7 +110,7 @@ def test_values_are_frozen_and_copies():
     mesh = Mesh(vertices, box().faces)
     vertices[0] = 99
     assert mesh.vertices_mm[0].max() <= 2
-    with pytest.raises(ValueError, match="read-only"):
+    with refused(ValueError):
         mesh.vertices_mm[0] = 0
     with pytest.raises(AttributeError):
         mesh.faces = mesh.faces
@@ -167,17 +168,17 @@ def test_configuration_survives_json():
 
 
 @pytest.mark.parametrize(
-    ("data", "says"),
+    ("data", "named"),
     [
         ({"name": "x", "colour": 1}, "colour"),
         ({"name": 1}, "name"),
         ({}, "name"),
         ({"name": "x", "kinds": [{"type": "third"}]}, "third"),
-        ([], "array"),
+        ([], "run.json"),
     ],
 )
-def test_wrong_configuration_is_refused_by_name(data, says):
-    with pytest.raises(InputError, match=rf"run\.json.*{says}"):
+def test_wrong_configuration_is_refused_by_name(data, named):
+    with refused(InputError, "run.json", named):
         from_builtins(data, Outer, "run.json")
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert(data, Outer)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from refused import refused
 from render_objects import bumpy, ray_hits, sphere
 from tumortrack.core.camera import d405, deproject
 from tumortrack.core.render import Visibility, render_depth
@@ -124,7 +125,7 @@ def _arrays(mesh):
 def test_faces_of_other_vertices_are_refused_and_vertices_that_are_no_number_not_drawn():
     corners = np.array([[-90.0, -60, 155], [100, -70, 250], [0, 80, 200], [0, np.nan, np.inf]])
     for faces in ([[0, 2, 4]], [[0, 2, -1]]):
-        with pytest.raises(ValueError, match="faces name vertices"):
+        with refused(ValueError):
             render_depth(corners, np.array(faces), CAMERA)
     drawn = render_depth(corners, np.array([[0, 2, 1], [0, 2, 3]]), CAMERA).depth_mm
     np.testing.assert_array_equal(drawn, depth_of(Mesh(corners[:3], [[0, 2, 1]])))

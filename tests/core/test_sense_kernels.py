@@ -5,17 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
+from scipy.special import ndtri
 
 from tumortrack.core import depth_kernels as kernels
 from tumortrack.core.camera import Pinhole
 from tumortrack.core.types import SensorCloud
 from tumortrack.segmentation import choose, pieces, plane, working_image
-from tumortrack.segmentation.smoothing import _smooth_depth
+from tumortrack.segmentation.smoothing import smooth_depth
 from tumortrack.segmentation.working_image import LAST_BOX, RANGE, WorkingImage
 
 CAMERA = Pinhole(50.0, 52.0, 14.3, 9.8)
 JUMP = 0.01, 1e-5
-FIRST = kernels._QUANTILES[0xE220A8397B1DCDAF % 2**14]  # SplitMix64's first number of seed 0
+# The normal quantile of SplitMix64's first number of seed 0, of 2^14, scaled to a variance of 1.
+EVERY = ndtri((np.arange(2**14) + 0.5) / 2**14)
+FIRST = np.float32(EVERY[0xE220A8397B1DCDAF % 2**14] / EVERY.std())
 
 
 def image_of(depth_mm, taken=None):
@@ -58,7 +61,7 @@ def test_smoothing_is_the_plane_through_its_neighbours():
     depth_mm = rough(1).depth_mm
     rows, columns, out = np.arange(2, 22, 3), np.arange(30), np.empty((7, 30), np.float32)
     reach, relative, slope = 2, 4e-5, 0.01
-    _smooth_depth(depth_mm, rows, columns, reach, relative, slope, out)
+    smooth_depth(depth_mm, rows, columns, reach, relative, slope, out)
     changed = 0
     for n, v in enumerate(rows):
         for m, u in enumerate(columns):
@@ -90,7 +93,7 @@ def test_a_box_keeps_what_lies_in_it():
     places = [(u - CAMERA.cx) / CAMERA.fx * z, (v - CAMERA.cy) / CAMERA.fy * z, z]
     inside = np.all([(a < p) & (p < b) for a, b, p in zip(low, high, places, strict=True)], axis=0)
     numbers = np.where(image.taken == 0, 1 + (u > 12), 0).astype(np.int32)
-    area = choose._area_inside(image, numbers, low, high, 3)
+    area = choose.area_inside(image, numbers, low, high, 3)
     for number in (1, 2):
         expected = (z[inside & (numbers == number)] ** 2).sum() / (CAMERA.fx * CAMERA.fy)
         assert area[number] == pytest.approx(expected, rel=1e-6)
@@ -105,7 +108,7 @@ def test_a_cloud_is_seen_from_its_origin():
     points = rng.uniform([-60, -40, 60], [60, 50, 150], (4000, 3)).astype(np.float32)
     points[:40, 2] *= -1  # behind the camera
     points[40:60, 0] = 500  # too far aside
-    tangents, (low, high, inner) = working_image._tangents(points)
+    tangents, (low, high, inner) = working_image.tangents_of(points)
     expected = points[60:, :2] / points[60:, 2:]
     np.testing.assert_array_equal(tangents[60:], expected)
     assert np.isnan(tangents[:60]).all()
@@ -113,7 +116,7 @@ def test_a_cloud_is_seen_from_its_origin():
     middle = np.ptp(np.quantile(expected, [0.02, 0.98], axis=0), axis=0)
     np.testing.assert_allclose(inner, middle, atol=0.01)
     depth_mm, pixel = np.full((20, 30), np.nan, np.float32), np.empty(4000, np.int32)
-    working_image._rasterise(tangents, points[:, 2].copy(), CAMERA, depth_mm, pixel)
+    working_image.rasterise(tangents, points[:, 2].copy(), CAMERA, depth_mm, pixel)
     u, v = np.trunc(tangents[60:].T * [[CAMERA.fx], [CAMERA.fy]] + [[CAMERA.cx], [CAMERA.cy]] + 0.5)
     there = (u >= 0) & (u < 30) & (v >= 0) & (v < 20)
     np.testing.assert_array_equal(pixel[60:], np.where(there, 30 * v + u, -1))
@@ -142,10 +145,10 @@ def test_the_best_plane_has_the_best_score():
         if score > best:
             best, expected = score, (*normal, normal @ a)
     found, offset = np.zeros(3, np.float32), np.zeros(1)
-    score = plane._consensus(points, triples, (3.0, 60.0), found, offset)
+    score = plane.consensus(points, triples, (3.0, 60.0), found, offset)
     assert score == pytest.approx(best, rel=1e-4)
     np.testing.assert_allclose([*found, *offset], expected, rtol=1e-4)
-    none = plane._consensus(points, triples[:, [0, 0, 0]].copy(), (3.0, 60.0), found, offset)
+    none = plane.consensus(points, triples[:, [0, 0, 0]].copy(), (3.0, 60.0), found, offset)
     assert none == -np.inf
 
 
@@ -159,7 +162,7 @@ def test_pixels_with_few_neighbours_are_isolated():
         apart = np.abs(there[0] - image.depth_mm)
         near += there[2] | ((there[1] == 0) & (apart < tolerance(image.depth_mm)))
     out = np.empty(near.shape, bool)
-    pieces._isolated(image.depth_mm, image.taken, JUMP, out)
+    pieces.find_isolated(image.depth_mm, image.taken, JUMP, out)
     np.testing.assert_array_equal(out, (image.taken == 0) & (near < 3))
     assert 20 < out.sum() < 400
 
@@ -171,7 +174,7 @@ def test_short_holes_whose_ends_agree_are_bridged():
     ]
     depth_mm = np.array(gaps, np.float32)
     out = np.empty_like(depth_mm)
-    pieces._without_holes(depth_mm, (depth_mm == 0).astype(np.uint8), JUMP, out)
+    pieces.bridge_holes(depth_mm, (depth_mm == 0).astype(np.uint8), JUMP, out)
     expected = np.where(depth_mm == 0, np.nan, depth_mm)
     expected[0, :5] = np.linspace(100, 101, 5)
     expected[1, 2:9] = np.linspace(90, 90.6, 7)
@@ -188,7 +191,7 @@ def test_edges_are_jumps_holes_and_folds():
 
     def distance(crease_mm):
         out = np.empty((62, 82), np.float32)
-        pieces._edge_distance(depth_mm, JUMP, crease_mm, 400.0, out)
+        pieces.edge_distances(depth_mm, JUMP, crease_mm, 400.0, out)
         return out[1:-1, 1:-1]
 
     exact = distance_transform_edt(~edge)
@@ -203,7 +206,7 @@ def test_pieces_grow_by_rounds_and_not_across_a_jump():
     depth_mm, numbers = np.full((30, 40), 100.0, np.float32), np.zeros((30, 40), np.int32)
     depth_mm[:, 22:] = 120
     numbers[15, 19], numbers[3, 35] = 1, 2
-    pieces._grow(depth_mm, numbers, JUMP, 200.0, np.empty(1200, np.int32))
+    pieces.grow_pieces(depth_mm, numbers, JUMP, 200.0, np.empty(1200, np.int32))
     expected = np.zeros((30, 40), int)
     expected[10:21, 14:22] = 1  # 1.4 * 200 / 100 + 2: five rounds
     expected[:9, 30:40] = 2  # and at 120 mm too
@@ -216,7 +219,7 @@ def test_a_piece_is_measured():
     numbers[5:9, 10:16], numbers[12:, 3] = 1, 2
     distance[6, 12] = 2.5
     image.taken[4, 10:13] = LAST_BOX
-    sizes = choose._measure(image, distance, numbers, 3)
+    sizes = choose.measure(image, distance, numbers, 3)
     np.testing.assert_allclose(sizes.area_mm2, [0, 24e4 / 2600, 8e4 / 2600, 0])
     np.testing.assert_allclose(sizes.thick_mm, [0, 10, 4, 0])  # at 100 mm a pixel is 2 mm wide
     assert sizes.wide_mm[1] == pytest.approx(0.7071 * (5 * 2 + 3 * 100 / 52))

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from refused import refused
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError, StorageError
 from tumortrack.core.types import Mesh
-from tumortrack.io.mesh_files import read_mesh, write_mesh
+from tumortrack.io.mesh_files import read_mesh
 
 
 def box(extents=(2, 3, 4), center=(0, 0, 0)):
@@ -65,7 +66,7 @@ def test_existing_folder_is_refused_or_swapped(tmp_path):
         write_case(tmp_path / "case", content)
     assert leftovers(tmp_path / "case") == ["manifest.json", "new"]
     with (
-        pytest.raises(InputError, match="overwrite=True"),
+        refused(InputError, "--overwrite"),
         store.new_folder(tmp_path / "case", overwrite=False),
     ):
         pytest.fail("the body must not run")
@@ -91,7 +92,7 @@ def test_overwriting_spares_what_is_not_ours(tmp_path):
     before = sorted(tmp_path.rglob("*"))
     for place in (photos, file, run, used):
         for write in (write_case, lambda path, _: store.check_place(path, "case", overwrite=True)):
-            with pytest.raises(InputError, match=place.name):
+            with refused(InputError, place.name):
                 write(place, "kidney.ply")
     with pytest.raises(InputError), store.new_folder(run, overwrite=True):
         pass  # unsealed
@@ -119,7 +120,7 @@ def test_old_folder_returns_when_the_swap_fails(tmp_path, monkeypatch):
 
     monkeypatch.setattr(store.os, "rename", refuse)
     with (
-        pytest.raises(StorageError, match="Input/output"),
+        refused(StorageError, tmp_path / "case"),
         store.new_folder(tmp_path / "case", overwrite=True) as aside,
     ):
         store.seal(aside, "case", {}, frame="lps")
@@ -177,7 +178,7 @@ def write_manifest(content: bytes):
 def test_damage_to_a_sealed_folder_is_found(sealed, damage):
     (sealed.parent / "outside").write_text("beside the folder")
     damage(sealed)
-    with pytest.raises(ArtifactError, match="case"):
+    with refused(ArtifactError, sealed):
         store.read_manifest(sealed, "case")
 
 
@@ -193,7 +194,7 @@ def test_damage_to_a_sealed_folder_is_found(sealed, damage):
 )
 def test_a_folder_of_another_schema_names_the_command_that_remakes_it(sealed, kind, command):
     edit(sealed, kind=kind, schema=1)
-    with pytest.raises(ArtifactError, match=f"schema 1;.*tumortrack {command} "):
+    with refused(ArtifactError, store.SCHEMA, f"tumortrack {command}"):
         store.read_manifest(sealed, kind)
 
 
@@ -241,16 +242,6 @@ def test_a_full_disk_keeps_what_was_there(tmp_path):
 # mesh files
 
 
-@pytest.mark.parametrize("suffix", [".ply", ".stl"])
-def test_a_mesh_survives_a_file(tmp_path, suffix):
-    mesh = box((20, 30, 41), (100, -200, 33.25))
-    write_mesh(tmp_path / f"box{suffix}", mesh)
-    again = read_mesh(tmp_path / f"box{suffix}")
-    assert again.vertices_mm.shape == (8, 3)  # STL's repeated corners are one vertex again
-    assert again.volume_mm3 == pytest.approx(20 * 30 * 41, rel=1e-5)  # closed, still outward
-    np.testing.assert_allclose(again.box_mm, mesh.box_mm, atol=1e-4)
-
-
 OFF = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
 OFF += "property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
 THREE = "0 0 0\n1 0 0\n0 1 0\n"
@@ -280,7 +271,7 @@ def test_what_killed_processes_left_is_cleared_and_what_another_writes_is_not(tm
     for name in (".run.aaaaaaaa.part", ".run.bbbbbbbb.old"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "file").write_text(name)
-    with pytest.raises(InputError, match="run"), store.new_folder(tmp_path / "run"):
+    with refused(InputError, tmp_path / "run"), store.new_folder(tmp_path / "run"):
         pass
     assert (tmp_path / "run" / "file").read_text() == ".run.bbbbbbbb.old"  # it came back
     (tmp_path / ".run.cccccccc.old").mkdir()  # killed behind the second renaming

@@ -26,6 +26,7 @@ from hypothesis import strategies as st
 
 from raw_files import ball, nifti_header, npy, npz, nrrd, pcd, ply, png, sphere
 from stereo_objects import endoscope
+from tumortrack.case.meshes import read_meshes
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import TumortrackError
@@ -158,8 +159,14 @@ KIT = {
     ],
 }
 
+
+def read_beside(path: Path) -> object:
+    """As an organ's mesh: repaired where it can be."""
+    return read_meshes([path])
+
+
 # What reads it, by the file's name, and valid contents.
-FILES: dict[str, tuple[str, tuple[object, ...]]] = {
+FILES: dict[str, tuple[Any, tuple[object, ...]]] = {
     "in.ply": (
         "tumortrack.io.depth_files:read_cloud",
         (ply(POINTS), ASCII_PLY + b"end_header\n1.5 2 150\n"),
@@ -169,8 +176,8 @@ FILES: dict[str, tuple[str, tuple[object, ...]]] = {
     "in.npy": ("tumortrack.io.depth_files:read_cloud", (npy(POINTS),)),
     "intrinsics.json": ("tumortrack.io.depth_files:read_intrinsics", (CAMERA,)),
     "stereo.yaml": ("tumortrack_devices.stereo:read_calibration", ()),
-    "in.nii": ("tumortrack.io.volume:read_raw", (NIFTI,)),
-    "in.nii.gz": ("tumortrack.io.volume:read_raw", (gzip.compress(NIFTI, mtime=0),)),
+    "in.nii": ("tumortrack.io.volume:read_volume", (NIFTI,)),
+    "in.nii.gz": ("tumortrack.io.volume:read_labels", (gzip.compress(NIFTI, mtime=0),)),
     "in.nrrd": (
         "tumortrack.io.volume:read_raw",
         (
@@ -179,8 +186,8 @@ FILES: dict[str, tuple[str, tuple[object, ...]]] = {
         ),
     ),
     **{
-        f"mesh.{kind}": (
-            "tumortrack.io.mesh_files:read_mesh",
+        f"kidney.{kind}": (
+            read_beside,
             (sphere(30).export(file_type=kind),),
         )
         for kind in ("stl", "ply", "obj")
@@ -217,7 +224,8 @@ def of_file(path: Path, read: Callable[[Path], object], content: bytes) -> objec
 @pytest.mark.parametrize("name", FILES)
 def test_files(name, tmp_path, times):
     reader, seeds = FILES[name]
-    read = partial(of_file, tmp_path / name, resolve_name(reader))
+    read = reader if callable(reader) else resolve_name(reader)
+    read = partial(of_file, tmp_path / name, read)
     check(read, list(map(_bytes, seeds)), times)
 
 

@@ -6,6 +6,7 @@ import pytest
 from pydicom.encaps import encapsulate, get_frame
 
 from dicom_objects import SYNTAXES, packed, write_slices
+from refused import refused
 from tumortrack.core.errors import InputError
 from tumortrack.io.dicom import read_dicom
 
@@ -78,7 +79,7 @@ def test_padding_and_long_values_are_left_as_they_are(tmp_path, capfd, recwarn):
 )
 def test_what_the_tags_leave_open_is_refused(tmp_path, tag, value):
     write_slices(tmp_path, numbers("<u2", 12), 12, lambda data: setattr(data, tag, value))
-    with pytest.raises(InputError, match=f"{tag} {value}"):
+    with refused(InputError, f"{tag} {value}"):
         read_dicom(tmp_path)
 
 
@@ -93,9 +94,9 @@ def test_a_picture_that_is_cut_or_of_another_size_is_refused(syntax, tmp_path, c
     frame = get_frame(data.PixelData, 0, number_of_frames=1)
     data.PixelData = encapsulate([frame[: len(frame) * 3 // 4]])
     data.save_as(paths[4])
-    with pytest.raises(InputError, match=paths[4].name) as refused:
+    with refused(InputError, paths[4].name) as error:
         read_dicom(tmp_path)
-    assert len(str(refused.value).splitlines()) == 1
+    assert len(str(error.value).splitlines()) == 1
     assert not recwarn.list
     assert capfd.readouterr().err == ""
     paths[4].write_bytes(whole)

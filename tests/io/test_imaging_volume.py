@@ -1,6 +1,7 @@
 """Readers: the same object lands at the same LPS points, whatever file it came in."""
 
 import gzip
+from contextlib import nullcontext
 
 import nibabel
 import numpy as np
@@ -18,6 +19,7 @@ from imaging_objects import (
     write_nifti,
     write_nrrd,
 )
+from refused import refused
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import spacing_mm
 from tumortrack.io import nifti
@@ -33,7 +35,6 @@ GRIDS = {
 }
 LPS = GRIDS["LPS"]
 GANTRY = LPS + 0.25 * np.eye(4)[[3, 2, 3, 3]] * [[0], [1], [0], [0]]  # slices 0.25 mm further back
-SHEARED = np.eye(4) + np.eye(4, k=1) * [0, 0.2, 0.1, 12.0]
 grids = pytest.mark.parametrize("affine", GRIDS.values(), ids=GRIDS.keys())
 
 
@@ -66,16 +67,16 @@ def test_dicom_slices_in_shuffled_files_are_sorted(tmp_path, affine):
 def test_dicom_gaps_doubles_strays_and_cut_pixels_are_refused(tmp_path):
     array = blob_array(LPS, SHAPE)
     write_dicom(tmp_path / "gap", array, LPS)[12].unlink()
-    with pytest.raises(InputError, match=f"{LPS[2, 3] + 11 * 0.8:.2f} mm"):
+    with refused(InputError, f"{LPS[2, 3] + 11 * 0.8:.2f} mm"):
         read_volume(tmp_path / "gap")
     copy = pydicom.dcmread(write_dicom(tmp_path / "twice", array, LPS)[3])
     copy.SOPInstanceUID = "1.2.9"  # another image at the same place
     copy.save_as(tmp_path / "twice" / "copy")
-    with pytest.raises(InputError, match=f"{LPS[2, 3] + 3 * 0.8:.2f} mm"):
+    with refused(InputError, f"{LPS[2, 3] + 3 * 0.8:.2f} mm"):
         read_volume(tmp_path / "twice")
     files = write_dicom(tmp_path / "cut", array, LPS)
     files[7].write_bytes(files[7].read_bytes()[:-1500])
-    with pytest.raises(InputError, match=files[7].name):
+    with refused(InputError, files[7].name):
         read_volume(tmp_path / "cut")
 
 
@@ -88,9 +89,9 @@ def test_among_several_series_the_only_real_ct_is_taken_or_a_list_given(tmp_path
     assert np.array_equal(read_volume(tmp_path).hu, array)
     assert np.array_equal(read_volume(tmp_path, "1.2.5").hu, array + 1)
     write_dicom(tmp_path, array + 2, LPS, uid="1.2.6")
-    with pytest.raises(InputError, match=r"series=(.|\n)*1\.2\.3, series 1\.2\.3, CT, 39 slices"):
+    with refused(InputError, "--series", "1.2.3", "1.2.6", "CT", "39 slices"):
         read_volume(tmp_path)
-    with pytest.raises(InputError, match="series="):
+    with refused(InputError, "--series"):
         read_volume(tmp_path, "9.9")
 
 
@@ -105,44 +106,24 @@ def test_labels_and_fractions_survive_writing(tmp_path, affine):
     assert np.array_equal(read_volume(tmp_path / "v.nii.gz").hu, array + 0.25)
 
 
-@pytest.mark.parametrize("number", [np.uint8, np.int16, np.float32, np.float64])
-@pytest.mark.parametrize("affine", [*GRIDS.values(), SHEARED], ids=[*GRIDS, "sheared"])
-def test_a_written_header_is_what_nibabel_reads_and_would_write(tmp_path, affine, number):
-    array = blob_array(affine, SHAPE).astype(number)
-    nifti.write_nifti(tmp_path / "v.nii", array, affine, lps=False)
-    found = nibabel.load(tmp_path / "v.nii")
-    assert np.array_equal(np.asarray(found.dataobj), array)
-    assert found.get_data_dtype() == number
-    theirs = nibabel.Nifti1Image(array, affine)
-    theirs.header.set_xyzt_units("mm")
-    theirs.set_sform(affine, code="scanner")
-    theirs.set_qform(affine, code=int(found.header["qform_code"]))
-    fields = ["dim", "bitpix", "xyzt_units", "sform_code", "srow_x", "srow_y", "srow_z"]
-    quaternion = ["quatern_b", "quatern_c", "quatern_d", "qoffset_x", "qoffset_y", "qoffset_z"]
-    orthogonal = affine is not SHEARED  # only such a grid has a quaternion
-    assert (found.header["qform_code"] == 1) == orthogonal
-    for field in fields + quaternion * orthogonal:
-        np.testing.assert_allclose(found.header[field], theirs.header[field], atol=2e-6)
-    np.testing.assert_allclose(found.header["pixdim"][:4], theirs.header["pixdim"][:4], rtol=1e-6)
-
-
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "named"),
     [
-        ({"affine": np.full((4, 4), np.nan)}, "NaN"),
-        ({"affine": np.diag([1.0, 0, 1, 1])}, "singular"),
-        ({"affine": np.ones((4, 4))}, "singular"),
-        ({"affine": np.diag([0.0007, 0.0007, 0.001, 1])}, "metres"),
-        ({"affine": np.diag([50.0, 1, 1, 1])}, "0.05 to 10 mm"),
-        ({"code": 0}, "orientation"),
-        ({"units": "meter"}, "meter"),
-        ({"shape": (4, 5, 6, 2)}, "4 axes"),
-        ({"shape": (4, 5, 1)}, "flat"),
-        ({"qform": np.diag([-1.0, 1, 1, 1])}, "disagree"),
-        ({"slope": (2, np.nan)}, "intercept"),
+        ({}, None),  # as it is, it is read
+        ({"affine": np.full((4, 4), np.nan)}, ()),
+        ({"affine": np.diag([1.0, 0, 1, 1])}, ()),
+        ({"affine": np.ones((4, 4))}, ()),
+        ({"affine": np.diag([0.0007, 0.0007, 0.001, 1])}, ["0.0007 x 0.0007 x 0.001"]),
+        ({"affine": np.diag([50.0, 1, 1, 1])}, ["0.05 to 10 mm"]),
+        ({"code": 0}, ("sform", "qform")),
+        ({"units": "meter"}, ["meter"]),
+        ({"shape": (4, 5, 6, 2)}, ["4 axes"]),
+        ({"shape": (4, 5, 1)}, ["4 x 5 x 1"]),
+        ({"qform": np.diag([-1.0, 1, 1, 1])}, ("sform", "qform")),
+        ({"slope": (2, np.nan)}, ()),
     ],
 )
-def test_implausible_nifti_headers_are_refused(tmp_path, change, words):
+def test_implausible_nifti_headers_are_refused(tmp_path, change, named):
     header = nibabel.Nifti1Header()
     header.set_data_shape(change.get("shape", (4, 5, 6)))
     header["vox_offset"], header["magic"] = 352, b"n+1"
@@ -154,7 +135,7 @@ def test_implausible_nifti_headers_are_refused(tmp_path, change, words):
         header.set_qform(change["qform"], code=1)
     header["scl_slope"], header["scl_inter"] = change.get("slope", (1, 0))
     (tmp_path / "v.nii").write_bytes(header.binaryblock + bytes(4 * 4 * 5 * 6 * 2))
-    with pytest.raises(InputError, match=words):
+    with nullcontext() if named is None else refused(InputError, "v.nii", *named):
         read_volume(tmp_path / "v.nii")
 
 
@@ -187,15 +168,15 @@ def test_either_byte_order_is_read_and_no_scale_means_the_numbers_as_they_are(
     np.testing.assert_array_equal(read_volume(tmp_path / "v.nii.gz").hu, voxels)
 
 
-@pytest.mark.parametrize(("side", "words"), [(100_000, "limit"), (1000, "shorter")])
-def test_huge_headers_are_refused_before_allocation(tmp_path, side, words):
+@pytest.mark.parametrize(("side", "named"), [(100_000, "8 GiB"), (1000, 10**9)])
+def test_huge_headers_are_refused_before_allocation(tmp_path, side, named):
     header = nibabel.Nifti2Header()
     header.set_data_shape((side, side, side))
     header.set_data_dtype(np.uint8)
     header.set_sform(np.eye(4), code=1)
     header["vox_offset"], header["magic"] = 544, b"n+2"
     (tmp_path / "v.nii.gz").write_bytes(gzip.compress(header.binaryblock + b"\0" * 4))
-    with pytest.raises(InputError, match=words):
+    with refused(InputError, "v.nii.gz", named):
         read_volume(tmp_path / "v.nii.gz")
 
 
@@ -207,24 +188,24 @@ NRRD = (
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("old", "new", "named"),  # as it is, it is read: below
     [
-        ("encoding: raw\n", "encoding: raw\ndata file: /etc/passwd\n", "another file"),
-        ("space: left-posterior-superior\n", "space dimension: 3\n", "orientation"),
-        ("sizes: 4 5 6", "sizes: 99999 99999 99999", "limit"),
-        ("sizes: 4 5 6", "sizes: 400 500 600", "shorter"),
-        ("sizes: 4 5 6", "sizes: 4 5 6 2", "4 axes"),
-        ("(0,0,1)", "(0,0,nan)", "NaN"),
-        ("(0,0,1)", "(0,0.0,0)", "singular"),
-        ("(1,0,0) (0,1,0) (0,0,1)", "(.001,0,0) (0,.001,0) (0,0,.001)", "metres"),
-        ("kinds:", 'space units: "m" "m" "m"\nkinds:', "millimetres"),
-        ("endian: little\n", "", "byte order"),
-        ("type: short", "type: block", "damaged"),
+        ("encoding: raw\n", "encoding: raw\ndata file: /etc/passwd\n", ()),
+        ("space: left-posterior-superior\n", "space dimension: 3\n", ["None"]),
+        ("sizes: 4 5 6", "sizes: 99999 99999 99999", ["8 GiB"]),
+        ("sizes: 4 5 6", "sizes: 400 500 600", [400 * 500 * 600 * 2]),
+        ("sizes: 4 5 6", "sizes: 4 5 6 2", ["4 axes"]),
+        ("(0,0,1)", "(0,0,nan)", ()),
+        ("(0,0,1)", "(0,0.0,0)", ()),
+        ("(1,0,0) (0,1,0) (0,0,1)", "(.001,0,0) (0,.001,0) (0,0,.001)", ["0.001 x 0.001 x 0.001"]),
+        ("kinds:", 'space units: "m" "m" "m"\nkinds:', ["'m'"]),
+        ("endian: little\n", "", ()),
+        ("type: short", "type: block", ()),
     ],
 )
-def test_implausible_nrrd_headers_are_refused(tmp_path, old, new, words):
+def test_implausible_nrrd_headers_are_refused(tmp_path, old, new, named):
     (tmp_path / "v.nrrd").write_bytes(NRRD.replace(old, new).encode() + b"\n" + bytes(240))
-    with pytest.raises(InputError, match=words):
+    with refused(InputError, "v.nrrd", *named):
         read_volume(tmp_path / "v.nrrd")
 
 
@@ -242,7 +223,7 @@ def test_other_and_empty_files_are_refused(tmp_path, name):
     for content in (None, b"", b"ObjectType = Image\nElementDataFile = /etc/passwd\n"):
         if content is not None:
             (tmp_path / name).write_bytes(content)
-        with pytest.raises(InputError, match=name):
+        with refused(InputError, name):
             read_volume(tmp_path / name)
     with pytest.raises(InputError):
         read_volume(tmp_path)
@@ -255,7 +236,7 @@ def test_label_maps_are_recognised_and_checked(tmp_path):
         assert is_label_map(read_raw(tmp_path / f"{name}.nii")) == (name == "float")
     assert set(np.unique(read_labels(tmp_path / "float.nii").labels)) == {0, 1, 3, 5, 7}
     for name in ("half", "ct"):
-        with pytest.raises(InputError, match=f"{name}.nii"):
+        with refused(InputError, f"{name}.nii"):
             read_labels(tmp_path / f"{name}.nii")
 
 

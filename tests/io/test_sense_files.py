@@ -13,6 +13,7 @@ from PIL import Image
 
 from depth_files import write_depth_png, write_intrinsics
 from depth_objects import SMALL, dome, pixels, wall
+from refused import refused
 from tumortrack.core.camera import d405, deproject
 from tumortrack.core.cloud import check_cloud
 from tumortrack.core.errors import InputError
@@ -104,7 +105,7 @@ def test_written_cloud_is_read_back_by_us_and_by_trimesh(points, tmp_path):
     raw = loaded.metadata["_ply_raw"]["vertex"]["data"]
     np.testing.assert_array_equal(raw["label"], labels)
     np.testing.assert_array_equal(raw["probability"], probability)
-    with pytest.raises(InputError, match="label"):
+    with refused(InputError, "label"):
         write_cloud_ply(path, points, label=labels[:5])
 
 
@@ -154,7 +155,7 @@ def test_organised_pcd_with_nans_loses_them_and_says_so(encoding, tmp_path):
 def test_npz_without_one_cloud_is_refused(arrays, tmp_path):
     path = tmp_path / "cloud.npz"
     path.write_bytes(npz_bytes(**arrays))
-    with pytest.raises(InputError, match=r"cloud\.npz"):
+    with refused(InputError, "cloud.npz"):
         read_cloud(path)
 
 
@@ -162,7 +163,7 @@ def test_points_mm_wins_and_contradicts_metres(points, tmp_path):
     path = tmp_path / "cloud.npz"
     path.write_bytes(npz_bytes(points=points / 1000, points_mm=points))
     np.testing.assert_array_equal(read_cloud(path)[0].points_mm, points)
-    with pytest.raises(InputError, match='unit="m"'):
+    with refused(InputError, "--unit m"):
         read_cloud(path, unit="m")
 
 
@@ -198,7 +199,7 @@ def huge_compressed_pcd():
 def test_counts_beyond_the_file_are_refused_before_allocation(suffix, content, tmp_path):
     path = tmp_path / f"cloud{suffix}"
     path.write_bytes(content)
-    with pytest.raises(InputError, match=path.name):
+    with refused(InputError, path.name):
         read_cloud(path)
 
 
@@ -207,7 +208,7 @@ def test_paths_that_are_no_clouds(name, tmp_path):
     (tmp_path / "folder.ply").mkdir()
     (tmp_path / "empty.ply").touch()
     (tmp_path / "empty.npz").touch()
-    with pytest.raises(InputError, match=name):
+    with refused(InputError, name):
         read_cloud(tmp_path / name)
 
 
@@ -245,13 +246,14 @@ def test_unit_and_correction_are_what_the_intrinsics_file_says(stored):
     assert corrected.depth_mm == pytest.approx(128.9, abs=1e-4)
     behind = stored(wall(19.0), depth_scale=0.98, depth_offset_mm=-19.0)
     assert np.isnan(behind.depth_mm).all()
-    for wrong in (
-        *({"depth_unit_mm": 0.0}, {"depth_scale": 98.0}),
-        *({"depth_offset_mm": 21}, {"depth_offset_mm": "1 mm"}),
-        *({"depth_left_mm": mm} for mm in (-1, 21, "1 mm")),
+    for key, value, named in (
+        ("depth_unit_mm", 0.0, "depth_unit_mm"),
+        *(("depth_scale", 98.0, "scale"), ("depth_offset_mm", 21, "offset_mm")),
+        ("depth_offset_mm", "1 mm", "depth_offset_mm"),
+        *(("depth_left_mm", mm, "depth_left_mm") for mm in (-1, 21, "1 mm")),
     ):
-        with pytest.raises(InputError, match=next(iter(wrong)).removeprefix("depth_")):
-            stored(wall(130.0), **wrong)
+        with refused(InputError, named):
+            stored(wall(130.0), **{key: value})
 
 
 @pytest.mark.parametrize(
@@ -271,7 +273,7 @@ def test_what_a_calibration_leaves_is_the_cameras(said, left_mm, stored):
 
 @pytest.mark.parametrize("mm", [7000.0, 6553.5, -5.0])  # 65535 steps stand for no depth
 def test_depths_that_16_bits_cannot_hold_are_refused(mm, tmp_path):
-    with pytest.raises(InputError, match=r"6553\.4"):
+    with refused(InputError, "6553.4"):
         write_depth_png(tmp_path / "depth.png", wall(mm))
     assert not list(tmp_path.iterdir())
 
@@ -280,11 +282,11 @@ def test_depth_png_of_another_size_or_depth_is_refused(tmp_path):
     png, camera = tmp_path / "depth.png", tmp_path / "intrinsics.json"
     write_intrinsics(camera, d405())
     write_depth_png(png, wall(130.0))
-    with pytest.raises(InputError, match=r"424 x 240.*848 x 480"):
+    with refused(InputError, "424 x 240", "848 x 480"):
         read_depth_png(png, camera)
     write_intrinsics(camera, SMALL)
     Image.fromarray(np.zeros((240, 424), np.uint8)).save(png)
-    with pytest.raises(InputError, match=r"depth\.png"):
+    with refused(InputError, "depth.png"):
         read_depth_png(png, camera)
 
 
@@ -312,5 +314,5 @@ def test_intrinsics_by_either_name_of_the_principal_point(tmp_path):
 def test_unusable_intrinsics_are_refused_by_name(change, tmp_path):
     path = tmp_path / "intrinsics.json"
     path.write_text(json.dumps({**GOOD, **change}))
-    with pytest.raises(InputError, match=next(iter(change))):
+    with refused(InputError, next(iter(change))):
         read_intrinsics(path)

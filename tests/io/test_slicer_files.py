@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from imaging_objects import (
     write_dicom,
 )
 from live_objects import small_estimate
+from refused import refused
 from tumortrack.case.meshes import read_meshes
 from tumortrack.case.surface import surfaces
 from tumortrack.core.errors import InputError
@@ -233,7 +233,7 @@ def test_without_highdicom_it_says_what_to_install(
     monkeypatch.setitem(sys.modules, "highdicom", None)
     affine = affine_lps("LPS", (1.0, 1.0, 1.0), np.eye(3))
     ct = ct_series(tmp_path / "ct", affine)
-    with pytest.raises(InputError, match=re.escape(to_install("tumortrack[dicom]"))):
+    with refused(InputError, to_install("tumortrack[dicom]")):
         write_dicom_seg(tmp_path / "seg.dcm", blob_labels(affine), segments(PARTS), ct)
 
 
@@ -248,7 +248,7 @@ def test_export_writes_both(tmp_path: Path, capsys: pytest.CaptureFixture) -> No
     save_case(case, tmp_path / "case")
     hu = np.where(labels.labels > 0, 100, -100).astype(np.float32)
     write_dicom_series(Volume(hu, labels.lps_from_index), tmp_path / "ct")
-    with pytest.raises(InputError, match="PHANTOM"):
+    with refused(InputError, "PHANTOM"):
         Export(case=tmp_path / "case", out=tmp_path / "out", dicom=tmp_path / "ct").run()
     asked = {"case": tmp_path / "case", "dicom": tmp_path / "ct", "patient": "PHANTOM"}
     Export(out=tmp_path / "out", **asked).run()
@@ -264,7 +264,7 @@ def test_export_writes_both(tmp_path: Path, capsys: pytest.CaptureFixture) -> No
     with pytest.raises(InputError):
         Export(case=tmp_path / "case", out=tmp_path / "out").run()
     for option in ({"series": "1"}, {"patient": "PHANTOM"}):
-        with pytest.raises(InputError, match=f"{next(iter(option))}="):
+        with refused(InputError, f"--{next(iter(option))}"):
             Export(case=tmp_path / "case", out=tmp_path / "new", **option).run()
     with pytest.raises(InputError):  # of an empty variable, say
         Export(out=tmp_path / "new", **{**asked, "patient": ""}).run()

@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 from depth_files import write_intrinsics
+from refused import refused
 from tumortrack.core.errors import InputError
 from tumortrack.core.store import natural, read_json
 from tumortrack.core.types import Intrinsics
@@ -136,11 +137,9 @@ FAULTS: dict[str, Callable[[Reader], list[str]]] = {
 def test_a_table_that_may_mean_two_things_is_refused_where_it_does(name, fault, tmp_path):
     reader, path = READERS[name], tmp_path / "t.csv"
     path.write_text("\n".join(FAULTS[fault](reader)))
-    with pytest.raises(InputError) as told:
+    where = ["line 3"] if "cell" in fault or "number" in fault else []
+    with refused(InputError, path, *where):
         reader.read(path)
-    assert str(path) in str(told.value)
-    if "cell" in fault or "number" in fault:
-        assert "line 3" in str(told.value)
 
 
 def test_an_outline_of_one_piece_and_touches_of_their_own(tmp_path):
@@ -152,7 +151,7 @@ def test_an_outline_of_one_piece_and_touches_of_their_own(tmp_path):
     (outline,) = read_evidence(path)[1]
     assert outline.places == ((1.0, 2.0, 150.0), (3.0, 4.0, 151.0))
     path.write_text(path.read_text().replace("outline", "touch"))
-    with pytest.raises(InputError, match="line 3"):
+    with refused(InputError, "line 3"):
         read_evidence(path)
 
 
@@ -175,12 +174,12 @@ def test_points_that_were_never_placed_are_left_out_and_counted(tmp_path):
 def test_evidence_that_is_none_and_a_tiff_of_several_images_are_refused(tmp_path):
     path = tmp_path / "e.json"
     path.write_text('{"frame": "camera", "unit": "mm", "evidence": []}')
-    with pytest.raises(InputError, match=r"e\.json"):
+    with refused(InputError, "e.json"):
         read_evidence(path)
     images = [Image.fromarray(DEPTHS.astype(np.uint16)) for _ in range(2)]
     images[0].save(tmp_path / "d.tif", save_all=True, append_images=images[1:])
     write_intrinsics(tmp_path / "i.json", CAMERA)
-    with pytest.raises(InputError, match=r"d\.tif"):
+    with refused(InputError, "d.tif"):
         read_depth(tmp_path / "d.tif", tmp_path / "i.json")
 
 
@@ -188,7 +187,7 @@ def test_evidence_that_is_none_and_a_tiff_of_several_images_are_refused(tmp_path
 def test_a_key_twice_is_refused(read, tmp_path):
     path = tmp_path / "f.json"
     path.write_text('{"frame_id": "a", "unit": "mm", "deep": [{"unit": "m", "unit": "mm"}]}')
-    with pytest.raises(InputError, match="'unit'"):
+    with refused(InputError, path, "'unit'"):
         read(path)
 
 
@@ -293,10 +292,8 @@ def test_a_depth_scale_that_is_a_unit_names_file_and_unit(tmp_path):
     path = tmp_path / "c.json"
     write_intrinsics(path, CAMERA)
     path.write_text(json.dumps({**json.loads(path.read_text()), "depth_scale": 0.1}))
-    with pytest.raises(InputError) as told:
+    with refused(InputError, path, "depth_unit_mm"):
         read_camera(path)
-    assert str(path) in str(told.value)
-    assert "depth_unit_mm" in str(told.value)
 
 
 def moved(shift: float) -> list[list[float]]:
@@ -324,9 +321,8 @@ def test_a_pose_beyond_any_room_is_refused_with_its_unit(read, tmp_path):
     assert read(path, "mm", 400) == read(path, "m", 0.4) == 400
     assert read(path, "mm", 4999) == 4999
     for unit, shift in (("m", 400), ("m", 5.1), ("mm", 5100), ("m", 1e300), ("m", np.nan)):
-        with pytest.raises(InputError) as told:
+        with refused(InputError, *([] if np.isnan(shift) else [f"{unit!r}"])):
             read(path, unit, shift)
-        assert np.isnan(shift) or f"{unit!r}" in str(told.value)
 
 
 # As easy_handeye (ROS 1, in both styles of YAML) and easy_handeye2 write a half turn about x.

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from camera_objects import ASIDE, BASE, seen_at
 from live_objects import STAMP_NS, small_update
+from refused import refused
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
 from tumortrack.live.calibration_file import read_frames
@@ -81,7 +82,7 @@ def test_a_calibration_names_the_camera_and_the_table(read):
     ],
 )
 def test_a_wrong_calibration_is_refused(read, content):
-    with pytest.raises(InputError, match=r"hand_eye\.json|error_"):
+    with refused(InputError, *(content.keys() & {"error_mm", "error_deg"} or ["hand_eye.json"])):
         read(**content)
 
 

@@ -13,6 +13,7 @@ import pytest
 from depth_files import write_depth_png, write_intrinsics
 from extension_objects import distribution, installed_example
 from live_objects import small_frame, small_setting, small_update
+from refused import refused
 from stories import COMMAND, environment
 from track_objects import World, ended_when, estimates, start
 from tumortrack.core.errors import InputError, StorageError
@@ -65,7 +66,7 @@ def test_an_installed_package_adds_a_sink(example, tmp_path):
 
 def test_a_sink_that_cannot_open_its_file_is_a_clear_line(example, tmp_path):
     named = named_sinks([f"csv:{tmp_path}/missing/centres.csv"])
-    with pytest.raises(StorageError, match="missing/centres"), open_sinks(named, small_setting()):
+    with refused(StorageError, "missing/centres"), open_sinks(named, small_setting()):
         pass
     with pytest.raises(InputError):
         named_sinks(["csv:a.csv", "csv:a.csv"])
@@ -96,9 +97,9 @@ def test_a_broken_package_breaks_its_own_kind_alone(example, tmp_path, monkeypat
     assert POSES.parse("file:poses.csv").path == Path("poses.csv")
     assert SINKS.parse(f"csv:{tmp_path}/a.csv").digits == 2
     for kind in ("lost", "number", "renamed"):
-        with pytest.raises(InputError, match="acme-sinks"):
+        with refused(InputError, "acme-sinks"):
             SINKS.parse(kind)
-    with pytest.raises(InputError, match=r"csv, lost, moveit, number, openigtlink, .*viewer"):
+    with refused(InputError, "csv", "lost", "number", "viewer"):
         SINKS.parse("screen")
     faults = {(one.package, one.name): one.fault for one in extensions()}
     assert faults["tumortrack-example", "csv"] == faults["tumortrack-example", "image"] == ""
@@ -113,22 +114,22 @@ def test_a_kind_of_ours_that_is_not_installed_is_named_with_its_package(monkeypa
         (POSES, "ur", "tumortrack-devices"),
         (TOOLS, "openigtlink", "tumortrack-devices"),
     ):
-        with pytest.raises(InputError) as refused:
+        with refused(InputError, to_install(package)):
             registry.parse(f"{kind}:x")
-        assert to_install(package) in str(refused.value)
     (tmp_path / "a.mcap").touch()
     for path in (tmp_path, tmp_path / "a.mcap"):
-        with pytest.raises(InputError, match="pip install"):
+        with refused(InputError, "pip install"):
             describe(path)
 
 
 def test_two_packages_with_one_kind_are_both_named(example, tmp_path, monkeypatch):
     twice = {"tumortrack.sinks": {"csv": "tumortrack_example.csv:CsvSinkConfig"}}
     monkeypatch.syspath_prepend(str(distribution(tmp_path / "other", "acme-sinks", twice)))
-    with pytest.raises(InputError, match="acme-sinks and tumortrack-example"):
+    with refused(InputError, "acme-sinks", "tumortrack-example"):
         SINKS.parse(f"csv:{tmp_path}/a.csv")
 
 
+@pytest.mark.slow
 def test_doctor_names_what_other_packages_add(tmp_path):
     broken = {"tumortrack.sources": {"lost": "no_such_module:Source"}}
     folders = [

@@ -12,7 +12,8 @@ import pytest
 from camera_objects import ALL, MS, Located, Notes, Tape, played, seen_at
 from clock import PATIENCE_S, Clock, until
 from live_objects import CAMERA, STAMP_NS, small_frame, small_setting
-from tumortrack.core.errors import InputError, NoEstimate, StorageError
+from refused import refused
+from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.types import DepthError, DepthFrame, Intrinsics
 from tumortrack.io.depth_files import DepthCorrection
 from tumortrack.live.loop import Loop, LoopConfig
@@ -170,16 +171,6 @@ def test_garbage_and_defects_are_said_and_survived():
     assert report["no_estimate"] == sum(report["reasons"].values()) == 3
 
 
-def test_a_full_disk_stops_nothing_but_its_sink():
-    class Full(Notes):
-        def publish(self, update):
-            raise StorageError("No space left on device")
-
-    told, report = played([Tape(0, 40, 80)], published=HERE, sink=Full())
-    assert report["estimates"]["good"] == len(told) == 3
-    assert report["sinks"]["notes"]["errors"] == 3
-
-
 # Time ----------------------------------------------------------------------------------------
 
 
@@ -221,12 +212,12 @@ def test_an_answer_that_comes_too_late_is_none_and_yet_a_start(clock, on_demand)
 class Waiting(SourceWorker):
     """Hands over a frame, and then nothing, without a thread."""
 
-    ended = False
+    ended, dropped = False, 0
 
     def __init__(self, clock):
         self.clock, self.waits = clock, []
         self.latency_from, self.trouble, self.failure = "stamp", "", None
-        self.ready_s, self.on_demand, self._passed, self._source = 0.001, False, 0, None
+        self.ready_s, self.on_demand = 0.001, False
 
     def take(self, timeout_s):
         self.waits.append(timeout_s)
@@ -299,7 +290,7 @@ def test_a_slow_opening_is_no_silence(clock):
         return Tape(100, on_demand=False)
 
     told = followed(clock, slow, gate, 90.0, give_up_s=1.0)
-    assert {one.reason for one in told[:-1]} == {"the source is still opening; 300 s are allowed"}
+    assert all("300 s" in one.reason for one in told[:-1])
     assert len(told) > 90 / 0.5
     assert told[-1].estimate is not None
 
@@ -335,14 +326,14 @@ def test_a_source_that_makes_frames_on_demand_is_never_silent(clock):
     gate, begin_s = threading.Event(), clock.monotonic()
     told = followed(clock, lambda: Tape(waits_for(gate), 100), gate, 90.0)
     assert clock.monotonic() - begin_s > 90  # more than is allowed to a camera
-    assert [one.reason for one in told if "still opening" not in one.reason] == [""]
+    assert [one.reason for one in told if "300 s" not in one.reason] == [""]
 
 
 def test_a_source_that_gives_nothing_but_errors_is_given_up(clock):
     def away():
-        raise SourceLost("the disk is gone")
+        raise SourceLost("disk 7")
 
-    with pytest.raises(SourceLost, match="the disk is gone"):
+    with refused(SourceLost, "disk 7"):
         followed(clock, away, threading.Event(), 1000.0)
 
     class Refused(Tape):
@@ -357,8 +348,7 @@ def test_a_source_that_gives_nothing_but_errors_is_given_up(clock):
 
 
 @pytest.mark.parametrize("on_demand", [False, True])
-def test_only_a_camera_is_opened_again_because_it_is_silent(clock, monkeypatch, on_demand):
-    monkeypatch.setattr("tumortrack.live.workers._AGAIN_S", 0.0)
+def test_only_a_camera_is_opened_again_because_it_is_silent(clock, on_demand):
     silent = [None, None, seen_at(100)]
 
     class Slow(Tape):
@@ -366,34 +356,10 @@ def test_only_a_camera_is_opened_again_because_it_is_silent(clock, monkeypatch, 
             clock.sleep(3.0)
             return silent.pop(0) if silent else super().read(timeout_s)
 
-    reader = SourceWorker(lambda: Slow(on_demand=on_demand))
+    reader = SourceWorker(lambda: Slow(on_demand=on_demand), again_s=0.0)
     assert isinstance(reader.take(PATIENCE_S), Observation)
     assert reader.opened == (1 if on_demand else 2)
     reader.close()
-
-
-def test_a_lost_source_comes_back(clock, monkeypatch):
-    monkeypatch.setattr("tumortrack.live.workers._AGAIN_S", 0.0)
-    tapes = [Tape(0, 40, SourceLost("unplugged"), on_demand=False), Tape(80, 120, on_demand=False)]
-    said, told = threading.Event(), []
-
-    def plug_in():
-        if len(tapes) == 1:  # however slow the machine: not before the loop has said why
-            assert said.wait(PATIENCE_S)
-        return tapes.pop(0)
-
-    def listen(result):
-        told.append(result)
-        if result.reason == "unplugged":
-            said.set()
-
-    loop = Loop(Located(), small_setting(), LoopConfig(region=ALL, stale_s=0.1))
-    reader = SourceWorker(plug_in)
-    loop.run(reader, [], listen)
-    reader.close()
-    assert sum(found(told)) == 4
-    assert reader.opened == 2
-    assert found(told)[:2] == found(told)[-2:] == [True, True]
 
 
 def test_a_source_that_stays_away_ends_the_loop_and_stop_ends_it_from_elsewhere():

@@ -7,7 +7,6 @@ import pytest
 
 from camera_objects import Tape, once, played
 from clock import PATIENCE_S, Clock, until
-from elastic_objects import UP
 from reports import poor
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import FollowOptions
@@ -16,27 +15,12 @@ from tumortrack.live.loop import Loop, LoopConfig
 from tumortrack.live.values import Controls, PublishedFrame, SinkContext
 from tumortrack.live.workers import SourceWorker
 from tumortrack.segmentation import RegionConfig
-from tumortrack.simulation.scene import SceneRecipe, Simulator, body_for
-from tumortrack.tracking.follower import Follower, FollowerConfig
-from tumortrack.tracking.model_files import load_model
-from tumortrack.tracking.tracker import Tracker
+from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from warp_objects import ANATOMY, slim_clinic
 
 FRAME_NS = 33_000_000
 WHOLE = RegionConfig(plane=False, flying=False, pieces=False, crop=slim_clinic().scene.cloud)
 CONFIG = LoopConfig(region=WHOLE, stale_s=PATIENCE_S / 2)
-
-
-@pytest.fixture(scope="module")
-def tracker(slim_model):
-    return Tracker(load_model(slim_model, "cpu"))
-
-
-@pytest.fixture(scope="module")
-def stages():
-    config = slim_clinic().scene
-    simulator = Simulator(ANATOMY, UP, config, body_for(ANATOMY, UP, config, 77))
-    return [simulator.render(SceneRecipe(5, "test", index)) for index in range(8)]
 
 
 def moving(stage, n, start_ns=10**15, step_mm=(0.4, -0.2, 0.1)):

@@ -13,6 +13,7 @@ import pytest
 from camera_objects import Notes, Tape
 from clock import PATIENCE_S, until
 from live_objects import small_frame, small_update
+from refused import refused
 from tumortrack.core.errors import InputError, NoEstimate, StorageError
 from tumortrack.core.report import Point
 from tumortrack.live.meter import Histogram
@@ -71,31 +72,27 @@ def test_text_becomes_configuration(text, expected):
     assert KINDS.parse(text) == expected
 
 
-USAGE = "Write camera:TOPIC[?fps=30.0&noise=true&type=auto&every=]."
+USAGE = "camera:TOPIC[?fps=30.0&noise=true&type=auto&every=]"
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "usage"),
     [
         ("screen", "camera, needle, window"),
-        ("needle?tip=1,2", "Write needle[?tip=0,0,80.5&point=]."),
+        ("needle?tip=1,2", "needle[?tip=0,0,80.5&point=]"),
         ("camera", USAGE),
         ("camera:/a?rate=3", USAGE),
         ("camera:/a?fps=fast", USAGE),
-        ("camera:/a?noise=2", USAGE),
         ("camera:/a?type=mesh", "auto, cloud"),
         ("camera:/a?every=0", ">= 1"),
-        ("camera:/a?topic=/b", USAGE),
         ("camera:/a?fps=1&fps=2", USAGE),
-        ("window:http", "Write window[:port]"),
-        ("needle:x", "Write needle["),
+        ("window:http", "window[:port]"),
+        ("needle:x", "needle["),
     ],
 )
-def test_wrong_text_is_answered_with_what_there_is(text, said):
-    with pytest.raises(InputError) as error:
+def test_wrong_text_is_answered_with_what_there_is(text, usage):
+    with refused(InputError, text, usage):
         KINDS.parse(text)
-    assert said in str(error.value)
-    assert text in str(error.value)
 
 
 def test_percentiles_are_right_to_one_per_cent():
@@ -175,9 +172,10 @@ def test_the_newest_frame_wins_and_the_others_are_counted(read):
 
 
 def test_exchanged_frames_are_noticed_by_a_loop_that_is_too_busy_to_see_both(read):
-    reader = read(Tape(*map(seen, (2, 1, 4, 3)), lossless=False))
-    until(lambda: reader.dropped == 1)  # 2, for 4
-    reader._thread.join(PATIENCE_S)
+    tape = Tape(*map(seen, (2, 1, 4, 3)), lossless=False)
+    reader = read(tape)
+    until(lambda: tape.closed)  # all are read: 2 was dropped, for 4
+    assert reader.dropped == 1
     assert isinstance(reader.take(PATIENCE_S), NoEstimate)
     assert reader.take(PATIENCE_S).stamp_ns == 4  # not 3, which came last
     assert reader.take(0.05) is None
@@ -243,10 +241,9 @@ def sequences(sink):
 
 
 @pytest.mark.parametrize(("waiting", "dropped"), [(1, (48, 49)), (64, (0,))])
-def test_a_slow_sink_gets_the_newest_or_all_that_may_wait(monkeypatch, waiting, dropped):
-    monkeypatch.setattr("tumortrack.live.workers._SILENT_S", PATIENCE_S)  # however slow we are
+def test_a_slow_sink_gets_the_newest_or_all_that_may_wait(waiting, dropped):
     sink = Gated()
-    outlet = SinkWorker("slow", sink, waiting)
+    outlet = SinkWorker("slow", sink, waiting, PATIENCE_S)  # however slow we are
     for n in range(50):
         outlet.put(small_update(n))
     until(lambda: sink.inside)
@@ -260,10 +257,9 @@ def test_a_slow_sink_gets_the_newest_or_all_that_may_wait(monkeypatch, waiting, 
     assert outlet.summary()["latency_ms"]["count"] == len(sink.updates)
 
 
-def test_a_sink_that_shows_is_told_when_the_loop_hangs(monkeypatch):
-    monkeypatch.setattr("tumortrack.live.workers._SILENT_S", 0.2)
+def test_a_sink_that_shows_is_told_when_the_loop_hangs():
     shown, kept = Notes(), Notes()
-    outlets = [SinkWorker("viewer", shown, 1), SinkWorker("recording", kept, 30)]
+    outlets = [SinkWorker("viewer", shown, 1, 0.2), SinkWorker("recording", kept, 30, 0.2)]
     for outlet in outlets:
         outlet.put(small_update(7))
     until(lambda: len(shown.updates) == 2)

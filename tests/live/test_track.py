@@ -18,8 +18,7 @@ def world(phantom_case, clinic_model):
 def test_a_moving_case_is_followed_and_the_report_says_how_well(world, tmp_path):
     report = tmp_path / "report.json"
     process = start(world, virtual(world, fps=10), "--report", report)
-    said = ended_when(process, lambda: estimates(report) >= 3)
-    assert "latency from stamp to published estimate: p50" in said
+    ended_when(process, lambda: estimates(report) >= 3)
     found = told(report)
     assert sum(found["estimates"].values()) >= 3
     assert found["center_error_mm"]["kidney"]["p50"] < 3
@@ -38,8 +37,7 @@ def test_a_report_that_cannot_be_written_ends_nothing(world, tmp_path):
     folder.rmdir()
     wait_for(process, "good:|poor:")
     said = ended_when(process, lambda: True)
-    assert "report: cannot write" in said
-    assert "estimates" in said
+    assert str(folder) in said
 
 
 @pytest.mark.parametrize(

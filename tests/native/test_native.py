@@ -1,7 +1,6 @@
 """Calls into the compiled kernels: what is refused before anything native runs; and their build."""
 
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +12,6 @@ from tumortrack import native
 from tumortrack.native import F32, F64, I32, kernel
 
 ROOT = Path(__file__).parents[2]
-SOURCES = ROOT / "src" / "tumortrack" / "native"
 
 # of registration.estimate: margins, one over each standard deviation, which of them, chances
 CHANCES = kernel("probabilities", F32["n"], F64["s"], I32["n"], F32["n"].out, result=int)
@@ -81,33 +79,10 @@ def test_arrays_that_cannot_be_written_and_empty_ones_are_read():
     assert CHANCES(*arrays) == CHANCES(*given(0)) == 0
 
 
-def test_every_kernel_of_the_library_is_declared_somewhere():
-    """What nothing calls is gone."""
-    defined = {
-        name
-        for source in SOURCES.rglob("*.c")
-        for name in re.findall(r"^KERNEL\(\w+, (\w+)\)", source.read_text("utf-8"), re.MULTILINE)
-    }
-    declared = {
-        name
-        for package in ROOT.glob("**/src/tumortrack*")
-        for source in package.rglob("*.py")
-        for name in re.findall(r'\bkernel\(\s*"(\w+)"', source.read_text("utf-8"))
-    }
-    assert len(defined) > 20
-    assert defined == declared
-
-
-@pytest.mark.parametrize("change", [{"_features": frozenset}, {"LIBRARIES": ROOT / "docs"}])
-def test_without_a_library_for_this_processor_there_is_one_error(change, monkeypatch):
-    for name, value in change.items():
-        monkeypatch.setattr(native, name, value)
-    native.library.cache_clear()
-    try:
-        with pytest.raises(ImportError):
-            native.library()
-    finally:
-        native.library.cache_clear()
+@pytest.mark.parametrize("folder", [native.LIBRARIES, ROOT / "docs"])
+def test_without_a_library_for_this_processor_there_is_one_error(folder):
+    with pytest.raises(ImportError):
+        native.library_in(folder, frozenset())
 
 
 def build(*arguments, **environment):
@@ -119,11 +94,6 @@ def build(*arguments, **environment):
 def test_a_compiler_that_is_not_there_ends_the_build_in_one_line():
     said = build(CC="no-such-compiler")
     assert said.returncode == 1
-    assert "no-such-compiler" in said.stderr
-    assert "Traceback" not in said.stderr
+    assert "no-such-compiler" in said.stderr.splitlines()[0]
+    assert len(said.stderr.splitlines()) == 1
     assert build("--compiler", CC="some cc").stdout == "some cc\n"
-
-
-def test_pip_and_make_build_with_the_same_ziglang():
-    locked = (ROOT / "requirements" / "compiler.txt").read_text().split()[0]
-    assert f'"{locked}"' in (ROOT / "tools" / "build_backend.py").read_text()

@@ -53,7 +53,7 @@ def test_an_access_beyond_an_array_is_seen(tmp_path):
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc's flags")
-def test_an_older_processor_gets_the_library_that_it_can_run(tmp_path, monkeypatch):
+def test_an_older_processor_gets_the_library_that_it_can_run(tmp_path):
     """As in wheels: one library for newer processors, one for all. They give the same bits."""
     sys.path.insert(0, str(ROOT / "tools"))
     import build_backend
@@ -62,16 +62,11 @@ def test_an_older_processor_gets_the_library_that_it_can_run(tmp_path, monkeypat
     answers = []
     for name, target in (("kernels", "x86-64"), ("kernels_v3", "x86-64-v3")):
         build_backend.build(["gcc"], tmp_path / f"{name}.elf", [f"-march={target}"])
-    monkeypatch.setattr(native, "LIBRARIES", tmp_path)
-    for features in (set(), native._features()):
-        monkeypatch.setattr(native, "_features", lambda features=features: frozenset(features))
-        native.library.cache_clear()
-        try:
-            needed = ctypes.c_char_p.in_dll(native.library(), "processor_features").value
-            chances = kernel("probabilities", F32["n"], F64["s"], I32["n"], F32["n"].out)
-            answers.append(np.empty(999, np.float32))
-            chances(*arrays, answers[-1])
-        finally:
-            native.library.cache_clear()
+    for features in (frozenset(), native.processor_features()):
+        chosen = native.library_in(tmp_path, features)
+        needed = ctypes.c_char_p.in_dll(chosen, "processor_features").value
+        takes = F32["n"], F64["s"], I32["n"], F32["n"].out
+        answers.append(np.empty(999, np.float32))
+        kernel("probabilities", *takes, within=chosen)(*arrays, answers[-1])
         assert (b"avx2" in needed) == ("avx2" in features)
     np.testing.assert_array_equal(*answers)

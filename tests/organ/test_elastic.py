@@ -9,6 +9,7 @@ import trimesh
 from scipy.linalg import expm
 
 from elastic_objects import CENTER, RADII, SMALL, UP, organ
+from refused import refused
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import Anatomy, Mesh
@@ -346,12 +347,12 @@ def test_a_body_survives_a_file(body, unchecked):
     )
     assert back.spacing_mm == body.spacing_mm
     lacking = {k: v for k, v in body.to_arrays().items() if k != "states"}
-    with pytest.raises(InputError, match="states"):
+    with refused(InputError, "states"):
         ElasticBody.from_arrays(lacking)
     torn = {**body.to_arrays(), "states": body.states[:, :7]}
-    with pytest.raises(InputError, match="states"):
+    with refused(InputError, "states"):
         ElasticBody.from_arrays(torn)
-    with pytest.raises(InputError, match="center_ct"):
+    with refused(InputError, "center_ct"):
         ElasticBody.from_arrays({**body.to_arrays(), "center_ct": np.full(3, np.nan)})
     with pytest.raises(InputError):  # no cell along an axis: a kernel would read beyond it
         ElasticBody.from_arrays({**body.to_arrays(), "modes": body.modes[:1]})

@@ -13,11 +13,11 @@ from tumortrack.core.evidence import Landmark, Touch
 from tumortrack.organ.rest_shape import error_covariance_mm2
 from tumortrack.registration.bend import (
     BentFit,
-    _Groups,
-    _Linear,
-    _Means,
-    _with_compliance,
+    Groups,
+    Linear,
+    Means,
     bend,
+    with_compliance,
 )
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.evidence import EvidenceTerms
@@ -39,7 +39,7 @@ TOP = VERTICES[FACING.argmax()]
 
 def pressed(seed):
     """The organ under forces in many places, which the library does not have."""
-    motion = _with_compliance(placed())
+    motion = with_compliance(placed())
     forces = np.random.default_rng(seed).normal(0, 8, motion.shape.body.compliance.shape[-1])
     forces[:12] = 0  # the smoothest, which the library has as well
     return motion.changed(np.concatenate([np.zeros(POSE + len(placed().coefficients)), forces]))
@@ -106,9 +106,9 @@ def test_an_organ_near_the_mean_has_a_narrow_prior_and_one_far_off_a_wide_one():
     spreads = []
     for share in (0.0, 1.0, 2.5):
         fit = refined(seen(placed(share=share)), START, CONFIG)
-        start = _with_compliance(fit.motion)
+        start = with_compliance(fit.motion)
         near, points_ct = fit.looks.residuals(start, CONFIG), start.back(fit.looks.points_mm)
-        groups = _Groups.near(fit, _Means.of(near, points_ct), CONFIG, None, 0.4)
+        groups = Groups.near(fit, Means.of(near, points_ct), CONFIG, None, 0.4)
         spreads.append(groups.likeliest()[1])
     assert spreads[0] < 0.9
     assert spreads == sorted(spreads)
@@ -118,9 +118,9 @@ def test_an_organ_near_the_mean_has_a_narrow_prior_and_one_far_off_a_wide_one():
 @pytest.mark.parametrize("std_mm", [0.5, 6.0])
 def test_the_evidence_is_that_of_all_unknowns(std_mm):
     fit = refined(seen(pressed(0)), START, CONFIG)
-    start, scale = _with_compliance(fit.motion), 0.7
+    start, scale = with_compliance(fit.motion), 0.7
     near = fit.looks.residuals(start, CONFIG)
-    means = _Means.of(near, start.back(fit.looks.points_mm))
+    means = Means.of(near, start.back(fit.looks.points_mm))
     rows = means.rows
     motion, field = rows[:, :-1], np.eye(len(rows))  # what neighbours share: an unknown a group
     slopes, distances_mm = np.concatenate([motion, field], axis=1), rows[:, -1]
@@ -144,13 +144,13 @@ def test_the_evidence_is_that_of_all_unknowns(std_mm):
     expected = weight @ (squares / (1 + squares / 4))
     expected += (off + change) @ precision @ (off + change)
     expected += np.linalg.slogdet(curvature)[1] - np.linalg.slogdet(precision)[1]
-    cost = _Groups.near(fit, means, CONFIG, None, scale).cost(std_mm, steps=40)
+    cost = Groups.near(fit, means, CONFIG, None, scale).cost(std_mm, steps=40)
     assert cost == pytest.approx(expected, rel=1e-3)
 
 
 def test_what_neighbours_and_tools_share_is_as_if_it_were_unknown():
     fit = refined(seen(pressed(1)), START, CONFIG)
-    start, scale = _with_compliance(fit.motion), 0.7
+    start, scale = with_compliance(fit.motion), 0.7
     how = {"std_mm": 0.8, "shared_std_mm": 1.5}
     touches = [Touch(place_mm=tuple(p), tool="a", **how) for p in PLACES[FACING < -0.2][::300]]
     inner = CENTER + [5.0, 0, 3]
@@ -162,7 +162,7 @@ def test_what_neighbours_and_tools_share_is_as_if_it_were_unknown():
     near, terms = looks.residuals(start, CONFIG), evidence.at(start)
     count = near.by_motion.shape[1]
     precision = np.eye(count)
-    at = _Linear.at(start, fit.moved, near, looks, precision, terms, scale)
+    at = Linear.at(start, fit.moved, near, looks, precision, terms, scale)
     error = start.shape.model_error
     places = np.concatenate([looks.points_mm, evidence.places_mm])
     field = np.eye(len(error.nodes_ct))[error.nearest(start.back(places))]

@@ -11,14 +11,16 @@ import numpy as np
 import pytest
 
 from elastic_objects import SMALL, UP
+from refused import refused
 from tumortrack.core import store
 from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.types import SensorCloud
 from tumortrack.io.case import Case, load_case, save_case
+from tumortrack.io.model_folder import is_model_of, save_model
 from tumortrack.registration.config import clinic
-from tumortrack.registration.model import build_model
+from tumortrack.registration.model import RegistrationModel, build_model
 from tumortrack.simulation.deform import DragConfig, ElasticConfig
-from tumortrack.tracking import model_files
+from tumortrack.simulation.noise import STEREO_NOISE
 from tumortrack.tracking.model_files import case_model, load_model, make_model
 from tumortrack.tracking.tracker import Tracker
 from warp_objects import ANATOMY, slim_clinic
@@ -45,56 +47,43 @@ def test_the_same_arguments_give_the_same_model_and_it_is_sane(slim_model):
         build_model(ANATOMY, UP, msgspec.structs.replace(slim_clinic(), scene=scene))
 
 
-@pytest.fixture
-def made(monkeypatch) -> list[Case]:
-    """The cases whose models are made, quickly."""
-
-    def slim(anatomy, *poses):
-        config = clinic(anatomy, *poses)
-        scene = msgspec.structs.replace(
-            config.scene, width=212, height=120, deform=(ElasticConfig(body=SMALL),)
-        )
-        return msgspec.structs.replace(config, scene=scene, scenes=6, searched=3)
-
-    cases: list[Case] = []
-
-    def noted(case, **given):
-        cases.append(case)
-        return make_model(case, **given)
-
-    monkeypatch.setattr(model_files, "clinic", slim)
-    monkeypatch.setattr(model_files, "make_model", noted)
-    return cases
+def slim(case: Case) -> RegistrationModel:
+    """A model of a case in seconds."""
+    config = clinic(case.anatomy, case.rotations)
+    deform = (ElasticConfig(body=SMALL),)
+    scene = msgspec.structs.replace(config.scene, width=212, height=120, deform=deform)
+    config = msgspec.structs.replace(config, scene=scene, scenes=6, searched=3)
+    return make_model(case, config)
 
 
-def test_a_case_keeps_its_model_until_it_changes(phantom_case: Path, made, tmp_path):
+def test_a_case_keeps_its_model_until_it_changes(phantom_case: Path, tmp_path):
     folder = tmp_path / "case"
     shutil.copytree(phantom_case, folder, ignore=shutil.ignore_patterns(Case.MODEL))
     case = load_case(folder)
-    first = case_model(case)
-    assert (folder / "model" / store.MANIFEST).is_file()
+    first = slim(case)
+    with store.new_folder(folder / "model") as aside:
+        save_model(first, aside)
     assert first.provenance["case_sha256"] == case.sha256
     assert first.patient == case.patient
+    kept = store.sha256_of(folder / "model")
     for again in (case_model(load_case(folder)), load_model(folder), Tracker(case).model):
         assert again.calibration == first.calibration
-    assert len(made) == 1
-    anyhow = replace(case, rotations="full", sensor="stereo")
-    save_case(anyhow, folder)
-    changed = load_model(folder)
-    assert len(made) == 2
-    assert changed.registration.prior.anyhow
-    assert not first.registration.prior.anyhow
-    assert changed.config.scene.noise != first.config.scene.noise
-    assert case_model(load_case(folder)).calibration == changed.calibration
-    assert len(made) == 2
-    (folder / "model" / "shape.safetensors").unlink()
-    with pytest.raises(ArtifactError, match=r"shape\.safetensors"):
+    assert store.sha256_of(folder / "model") == kept
+    (folder / "model" / "shape.safetensors").rename(folder / "aside")
+    with refused(ArtifactError, "shape.safetensors"):
         load_model(folder)
+    (folder / "aside").rename(folder / "model" / "shape.safetensors")
+    assert is_model_of(folder / "model", folder)
+    save_case(replace(case, rotations="full", sensor="stereo"), folder)
+    assert not is_model_of(folder / "model", folder)  # another is made in its place
 
 
-def test_a_case_that_lies_nowhere_has_a_model_all_the_same(phantom_case, made):
-    tracker = Tracker(replace(load_case(phantom_case), folder=None))
-    assert len(made) == 1
+@pytest.mark.slow
+def test_a_case_that_lies_nowhere_has_a_model_all_the_same(phantom_case):
+    seen_anyhow = replace(load_case(phantom_case), rotations="full", sensor="stereo")
+    tracker = Tracker(replace(seen_anyhow, folder=None))
+    assert tracker.model.registration.prior.anyhow
+    assert tracker.model.config.scene.noise == STEREO_NOISE
     organ = tracker.anatomy_ct.organ
     places = (organ.vertices_mm - organ.box_mm.mean(0))[:, [0, 2, 1]] * [1, -1, 1] + [0, 0, 160]
     near = places[places[:, 2] < np.median(places[:, 2])]

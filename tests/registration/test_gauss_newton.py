@@ -106,7 +106,7 @@ def test_sums_are_those_of_the_rows_and_rows_those_of_plain_arithmetic(state):
     config = GaussNewtonConfig(first_mm=2.0, n_effective=1e6)  # each point weighs one
     begun, precision = descent(points, motion, config), prior_precision(shape(), config)
     begun.run(0)
-    equations = begun._state
+    equations = begun.state
     np.testing.assert_array_equal(equations.distances_mm, rows[:, -1])
     assert np.abs(equations.distances_mm).max() > 2
     pulled = rows / (1 + (rows[:, -1:] / 2.0) ** 2)

@@ -17,7 +17,7 @@ from tumortrack.report.pictures import (
     sampled,
     write_sheet,
 )
-from tumortrack.report.renderer import Body, Frame, ParallelView, render
+from tumortrack.report.renderer import ParallelView
 from tumortrack.report.slices import ORIENTATIONS, SlicePlane
 from tumortrack.report.wrapping import wrapped
 
@@ -38,27 +38,6 @@ def test_sections_of_a_ball_are_circles_of_the_right_size():
         np.testing.assert_allclose(away, radius, atol=0.03)
         length = np.linalg.norm(outline[:, 1] - outline[:, 0], axis=1).sum()
         assert length == pytest.approx(2 * np.pi * radius, rel=1e-3)  # closed, nothing doubled
-
-
-def drawn(view, bodies, frame):
-    return render(bodies, view.viewpoint(frame, 0.3), frame.size(0.3)).astype(int)
-
-
-def test_shading_hides_what_lies_behind():
-    red, green = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
-    near, far = Body(ball(5, (0, 0, 100)), red), Body(ball(8, (0, 0, 130)), green)
-    frame = FROM_CAMERA.frame_around(far.mesh.vertices_mm)
-    for bodies in ([near, far], [far, near]):
-        picture = drawn(FROM_CAMERA, bodies, frame)
-        x, y = frame.pixel_centres(0.3)
-        middle = picture[np.abs(y).argmin(), np.abs(x).argmin()]
-        rim = picture[np.abs(y).argmin(), np.abs(x - 6.5).argmin()]
-        assert middle[0] > 2 * middle[1]
-        assert rim[1] > 2 * rim[0]
-        np.testing.assert_array_equal(picture[0, 0], 255)
-    back = ParallelView("from behind", (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-    behind = drawn(back, [near, far], Frame(-13.0, 13.0, -13.0, 13.0))
-    assert behind[43, 43, 1] > 2 * behind[43, 43, 0]  # from behind the far one covers the near
 
 
 @pytest.mark.parametrize("view", [FROM_CAMERA, FROM_SIDE, CORONAL, SAGITTAL])

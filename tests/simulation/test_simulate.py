@@ -11,7 +11,7 @@ from scipy.stats import kstest
 from render_objects import anatomy, sphere
 from tumortrack.core.geometry import direction_lps, transform_points
 from tumortrack.simulation.deform.base import View
-from tumortrack.simulation.deform.drag import CONFIGURATIONS, DragConfig, Drags, _centres
+from tumortrack.simulation.deform.drag import CONFIGURATIONS, DragConfig, Drags
 from tumortrack.simulation.scene import PoseConfig, sample_pose
 
 ANATOMY = anatomy()
@@ -76,10 +76,6 @@ def in_front(points_ct):
 VIEW = View(ANATOMY, in_front)
 
 
-def one_drag(center=(0, 0, 0), shift=(3.0, -4.0, 1.0), sigma=6.0):
-    return Drags(*(np.array(v, np.float32) for v in ([center], [shift], [sigma])))
-
-
 def slow_drags(drags, points):
     out = points.astype(float)
     for center, shift, sigma in zip(
@@ -102,18 +98,6 @@ def test_configurations_are_the_papers_table(shared_data):
         steps = tuple((float(d), float(s), int(n)) for d, s, n in triples)
         assert steps == CONFIGURATIONS[number]
     assert number == len(CONFIGURATIONS) == 6
-
-
-def test_one_drag_moves_its_centre_by_its_shift_and_falls_off_as_a_gaussian():
-    drag = one_drag(center=(10, 20, 30))
-    distance = np.array([0, 3, 6, 12, 18, 24, 60])
-    points = np.array([10.0, 20, 30]) + distance[:, None] * np.array([0.6, 0, 0.8])
-    moved = drag.apply(points) - points
-    np.testing.assert_allclose(moved[0], [3, -4, 1], atol=1e-5)
-    expected = np.exp(-(distance**2) / (2 * 6.0**2))
-    np.testing.assert_allclose(moved @ [3, -4, 1] / 26, expected, atol=2e-6)
-    assert (moved[-1] == 0).all()
-    assert expected[2] == pytest.approx(0.60653, abs=1e-5)  # exp(-1/2) at one sigma
 
 
 @pytest.mark.parametrize("number", CONFIGURATIONS)
@@ -150,16 +134,3 @@ def test_drags_start_at_visible_vertices_and_keep_to_their_steps(falloff):
     assert kstest(shares, "uniform").pvalue > 1e-3
     assert kstest(np.array(directions)[:, 2], "uniform", (-1, 2)).pvalue > 1e-3
     assert len(np.unique(starts, axis=0)) > 50
-
-
-def test_centres_are_dragged_as_any_point_bit_for_bit():
-    rng = np.random.default_rng(0)
-    start = rng.uniform(-50, 50, (18, 3)).astype(np.float32)
-    shifts = rng.normal(0, 3, (18, 3)).astype(np.float32)
-    sigmas = rng.uniform(3, 30, 18).astype(np.float32)
-    centres = start.copy()
-    for k in range(1, len(start)):
-        before = Drags(centres[:k], shifts[:k], sigmas[:k])
-        centres[k] = before.apply(start[k : k + 1])[0]
-    np.testing.assert_array_equal(_centres(start, shifts, sigmas), centres)
-    assert np.abs(centres - start).max() > 1.0

@@ -14,6 +14,7 @@ from live_objects import PARTS, STAMP_NS, small_estimate, small_frame
 from reports import poor
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import HERE, rigid
+from tumortrack.core.report import Finding
 from tumortrack.live.cameras import Cameras
 from tumortrack.live.loop import Loop, LoopConfig, summary
 from tumortrack.live.poses import CameraPoses
@@ -140,7 +141,7 @@ class Led(CameraPoses):
 
     def pose(self, seen):
         if seen.stamp_ns >= self._until_ns:
-            raise NoEstimate("where the camera was is unknown: no pose has come")
+            raise NoEstimate(Finding("no_pose"))
         way = BASE.copy()
         way[0, 3] += (seen.stamp_ns - STAMP_NS) / (10 * MS)  # mm
         return way

@@ -1,7 +1,8 @@
-"""What is refused: by the kind of error, and the data that it names."""
+"""What is refused: by the kind of error, and the data that it names. Never by its sentence."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -9,9 +10,11 @@ import pytest
 
 
 @contextmanager
-def refused(kind: type[Exception], *data: object) -> Iterator[None]:
-    """An error of this kind that names each of ``data``: a file, a row, a key, a number."""
+def refused(kind: type[Exception], *data: object) -> Iterator[pytest.ExceptionInfo[BaseException]]:
+    """An error of this kind that names each of ``data``: a file, a row, a key; a number whole."""
     with pytest.raises(kind) as raised:
-        yield
+        yield raised
+    said = str(raised.value)
     for one in data:
-        assert str(one) in str(raised.value)
+        whole = rf"(?<![\d.]){one}(?!\.?\d)" if isinstance(one, int) else re.escape(str(one))
+        assert re.search(whole, said), f"{one!r} is not in {said!r}"

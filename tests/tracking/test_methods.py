@@ -9,6 +9,7 @@ import pytest
 
 import tumortrack as tt
 from extension_objects import distribution
+from refused import refused
 from tumortrack.cli.doctor import Doctor
 from tumortrack.core.errors import InputError, PackageError, TumortrackError
 from tumortrack.registration.base_model import ModelConfig
@@ -75,7 +76,7 @@ def test_a_package_brings_a_method(guess, slim_model, phantom_case, tmp_path, ca
 
 @pytest.mark.usefixtures("guess")
 def test_a_configuration_of_no_method_is_refused(phantom_case, tmp_path):
-    with pytest.raises(InputError, match="guess"):
+    with refused(InputError, "guess"):
         tt.train(phantom_case, tmp_path / "model", config=Unknown())
     with pytest.raises(InputError):
         tt.train(phantom_case, tmp_path / "model", config=Unknown(), sensor="stereo")
@@ -85,8 +86,9 @@ def test_a_broken_method_is_named_and_stops_no_other(tmp_path, monkeypatch, caps
     distribution(tmp_path, "aaa", {"tumortrack.methods": {"aaa": "no_such_module:METHOD"}})
     monkeypatch.syspath_prepend(str(tmp_path))
     assert "quick" in method_of_preset("quick").presets
-    with pytest.raises(PackageError, match="aaa"):
+    with refused(PackageError, "aaa"):
         method_of_config(Unknown())
     with pytest.raises(TumortrackError):
         Doctor().run()
-    assert "BROKEN   method aaa of the package" in capsys.readouterr().out
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if line.startswith("BROKEN ") and "aaa" in line]

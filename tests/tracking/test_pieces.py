@@ -14,17 +14,10 @@ from tumortrack.core.errors import NotThisOrgan
 from tumortrack.core.render import render_depth
 from tumortrack.core.types import Look, SensorCloud
 from tumortrack.segmentation import Hints
-from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.options import LocateOptions
 from tumortrack.tracking.pieces import likeliest_piece
-from tumortrack.tracking.tracker import Tracker
 from tumortrack.tracking.views import View, as_fitted
 from warp_objects import ANATOMY, placed
-
-
-@pytest.fixture(scope="module")
-def tracker(slim_model):
-    return Tracker(load_model(slim_model, "cpu"))
 
 
 @pytest.fixture(scope="module")

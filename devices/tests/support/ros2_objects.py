@@ -86,15 +86,13 @@ def sending(kind: str, hz: float = 50) -> Iterator[str]:
 
 
 def read_until(source: Source) -> Observation:
-    """Its first frame, of a publisher that may still be starting."""
+    """Its next whole frame, of a publisher that may still be starting: what belongs to an image
+    comes on topics of its own."""
 
     def frame() -> Observation | None:
-        try:
+        with suppress(InputError):
             return source.read(0.2)
-        except InputError as error:
-            if "nobody publishes" not in str(error):
-                raise
-            return None
+        return None
 
     return until(frame, "a frame")
 
@@ -139,6 +137,9 @@ class Other:
 
         self.lines_until(heard)
         return last
+
+    def running(self) -> bool:
+        return self._process.poll() is None
 
     def ended(self) -> int:
         """Its exit code."""

@@ -37,7 +37,7 @@ _SPREAD = ("median", "90 %", "95 %", "worst")
 
 def table_of(frame: pd.DataFrame) -> str:
     """A frame as Markdown; columns of numbers are right-aligned."""
-    cells = frame.astype(str).to_numpy().tolist()
+    cells = [list(map(str, row)) for row in frame.astype(object).to_numpy()]
     rule = [
         "---:" if all(_NUMBER.match(row[n]) for row in cells) else "---"
         for n in range(len(frame.columns))

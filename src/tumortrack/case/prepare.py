@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from tumortrack.case.options import PrepareOptions, parse_structures
 from tumortrack.case.select import among, neighbours, select_labels
 from tumortrack.case.structures import extent_report, parts_of, read_structures, split_structures
 from tumortrack.case.surface import surfaces
-from tumortrack.case.symmetry import ambiguous, half_turns, warning
+from tumortrack.case.symmetry import HalfTurn, ambiguous, half_turns, warning
 from tumortrack.core import store
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import direction_lps, spacing_mm
@@ -56,9 +56,14 @@ _USUAL_ML = {"kidney": (40.0, 800.0), "liver": (500.0, 3500.0), "prostate": (10.
 _MOST_CHANGE_PERCENT = 1.0  # of a part's volume by smoothing, without a note
 
 
-def prepare(input: Path | Sequence[Path], options: PrepareOptions | None = None) -> Case:
+def prepare(
+    input: Path | Sequence[Path],
+    options: PrepareOptions | None = None,
+    turns_of: Callable[[Anatomy], list[HalfTurn]] = half_turns,
+) -> Case:
     """A case from any supported input: a folder or file, or several files of meshes or of labels,
-    one structure each. Writes nothing. Raises InputError: unusable input."""
+    one structure each. ``turns_of``: how alike the organ looks after half a turn. Writes nothing.
+    Raises InputError: unusable input."""
     options = options or PrepareOptions()
     paths = [input] if isinstance(input, Path) else list(input)
     try:
@@ -85,7 +90,7 @@ def prepare(input: Path | Sequence[Path], options: PrepareOptions | None = None)
     except OSError as error:
         where = error.filename or ", ".join(map(str, paths))
         raise InputError(f"{where} cannot be read: {error.strerror or error}.") from error
-    turns, notes = half_turns(case.anatomy), case.report["notes"]
+    turns, notes = turns_of(case.anatomy), case.report["notes"]
     text = warning(ambiguous(turns))
     report = case.report | {
         "source": ", ".join(path.name for path in paths),

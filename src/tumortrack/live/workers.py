@@ -59,8 +59,8 @@ class SourceWorker:
     taken, the newest stays and the others count as dropped; a ``lossless`` source waits. An error
     about a frame, its order too, is handed over before later frames."""
 
-    def __init__(self, open_source: Callable[[], Source]) -> None:
-        self._open = open_source
+    def __init__(self, open_source: Callable[[], Source], again_s: float = _AGAIN_S) -> None:
+        self._open, self._again_s = open_source, again_s
         self._lock = threading.Condition()
         self._newest: tuple[Observation, str] | None = None
         self._refused: TumortrackError | None = None  # since the last frame that was taken
@@ -140,7 +140,7 @@ class SourceWorker:
                 self._note(error)
             self.ready_s = self.ready_s or time.monotonic()
             if not self._over:
-                self._stop.wait(_AGAIN_S)
+                self._stop.wait(self._again_s)
         with self._lock:
             self._lock.notify_all()
 
@@ -196,8 +196,8 @@ class SinkWorker:
     """Hands results to one sink. More than ``waiting`` are dropped, oldest first, and counted;
     errors are counted and the last one kept."""
 
-    def __init__(self, name: str, sink: Sink, waiting: int) -> None:
-        self.name = name
+    def __init__(self, name: str, sink: Sink, waiting: int, silent_s: float = _SILENT_S) -> None:
+        self.name, self._silent_s = name, silent_s
         self._sink = sink
         self.notes: tuple[str, ...] = getattr(sink, "notes", ())
         self._waiting: deque[tuple[TrackingResult, float]] = deque(maxlen=waiting)
@@ -250,7 +250,7 @@ class SinkWorker:
         shown: TrackingResult | None = None  # the last result, until silence replaced it
         while True:
             with self._lock:
-                self._lock.wait_for(lambda: self._waiting or self._stop, _SILENT_S)
+                self._lock.wait_for(lambda: self._waiting or self._stop, self._silent_s)
                 waiting = self._waiting.popleft() if self._waiting else None
                 if waiting is None and self._stop:
                     break
@@ -260,8 +260,8 @@ class SinkWorker:
             elif shown is not None and self._waiting.maxlen == 1:  # it shows the present
                 silence = TrackingResult(
                     shown.sequence,
-                    shown.stamp_ns + int(_SILENT_S * 1e9),
-                    reason=f"the loop has said nothing for {_SILENT_S:g} s",
+                    shown.stamp_ns + int(self._silent_s * 1e9),
+                    reason=f"the loop has said nothing for {self._silent_s:g} s",
                     published_frame=shown.published_frame,
                 )
                 self._publish(silence, 0.0)

@@ -111,17 +111,23 @@ I32, I64, U8, BOOL = (Array(dtype) for dtype in (np.int32, np.int64, np.uint8, n
 Argument = Array | type[float] | type[int] | tuple["Argument", ...]
 
 
-def kernel(name: str, *arguments: Argument, result: type[float] | type[int] | None = None) -> Any:
-    """The function ``name`` of the library. Calling it raises TypeError or ValueError for what is
-    not declared so, before anything native runs."""
+def kernel(
+    name: str,
+    *arguments: Argument,
+    result: type[float] | type[int] | None = None,
+    within: ctypes.CDLL | None = None,
+) -> Any:
+    """The function ``name`` of the library, or of another. Calling it raises TypeError or
+    ValueError for what is not declared so, before anything native runs."""
     layout = struct.Struct("=" + "".join(map(_code, arguments)))
     fixed: dict[int | str, int] = {n: n for n in _sizes(arguments) if isinstance(n, int)}
 
     @cache
     def function() -> Callable[[bytes], Any]:
-        found = library()[name]  # an object of this declaration alone
+        kernels = within or library()
+        found = kernels[name]  # an object of this declaration alone
         found.argtypes, found.restype = [ctypes.c_char_p], _RESULTS[result]
-        takes = ctypes.c_int64.in_dll(library(), f"{name}_bytes").value
+        takes = ctypes.c_int64.in_dll(kernels, f"{name}_bytes").value
         if takes != layout.size:
             raise ImportError(f"kernel {name}: {layout.size} bytes declared, of {takes}. {_AGAIN}")
         return found
@@ -165,18 +171,23 @@ def _sizes(arguments: Sequence[Any]) -> Iterator[int | str]:
 @cache
 def library() -> ctypes.CDLL:
     """The kernels for this processor. Raises ImportError: there are none."""
-    names = sorted(path.name for path in LIBRARIES.glob("kernels*.elf"))
+    return library_in(LIBRARIES, processor_features())
+
+
+def library_in(folder: Path, features: frozenset[str]) -> ctypes.CDLL:
+    """The kernels in a folder for a processor with these features. Raises ImportError: none."""
+    names = sorted(path.name for path in folder.glob("kernels*.elf"))
     for name in reversed(names):  # the one for newer processors last
-        found = ctypes.CDLL(str(LIBRARIES / name))
+        found = ctypes.CDLL(str(folder / name))
         needed = ctypes.c_char_p.in_dll(found, "processor_features").value or b""
-        if set(needed.decode().split()) <= _features():
+        if set(needed.decode().split()) <= features:
             return found
     what = "were built for another processor; remove them" if names else "are not built"
-    raise ImportError(f"tumortrack's kernels, {LIBRARIES / 'kernels.elf'}, {what}. {_AGAIN}")
+    raise ImportError(f"tumortrack's kernels, {folder / 'kernels.elf'}, {what}. {_AGAIN}")
 
 
 @cache
-def _features() -> frozenset[str]:
+def processor_features() -> frozenset[str]:
     """Of this processor, as Linux names them."""
     with open("/proc/cpuinfo") as lines:  # beside many processors the first ones tell
         for line in lines:

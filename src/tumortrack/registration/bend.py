@@ -77,18 +77,18 @@ class BentFit:
 def bend(fit: RegistrationResult, config: GaussNewtonConfig) -> BentFit:
     """A fit of the library, continued in the compliance that its points ask for; with its rivals,
     which stay as they are."""
-    start, looks = _with_compliance(fit.motion), fit.looks
+    start, looks = with_compliance(fit.motion), fit.looks
     near, usual = looks.residuals(start, config), looks.weight(config)
-    means = _Means.of(near, start.back(looks.points_mm))
+    means = Means.of(near, start.back(looks.points_mm))
     scale = min(max(means.misfit_mm / _USUAL_MISFIT_MM, _SCALES[0]), _SCALES[1])
     config = msgspec.structs.replace(config, sigma_mm=scale * config.sigma_mm)
     near = replace(near, weights=near.weights * (looks.weight(config) / usual))
     terms = None if looks.evidence is None else looks.evidence.at(start)
-    std_mm, spread = _Groups.near(fit, means, config, terms, scale).likeliest()
+    std_mm, spread = Groups.near(fit, means, config, terms, scale).likeliest()
     of_library = prior_precision(fit.motion.shape, config)
     of_library[POSE:, POSE:] /= spread**2
     precision = _blocks(of_library, _precision_of_forces(near, len(of_library), std_mm))
-    at = _Linear.at(start, fit.moved, near, looks, precision, terms, scale)
+    at = Linear.at(start, fit.moved, near, looks, precision, terms, scale)
     steps = 1 if terms is None else 2  # more leave the same errors; evidence is judged on the way
     for _ in range(steps):
         at = at.moved_by(looks, precision, config, scale)
@@ -108,7 +108,7 @@ def bend(fit: RegistrationResult, config: GaussNewtonConfig) -> BentFit:
     )
 
 
-def _with_compliance(motion: ElasticMotion) -> ElasticMotion:
+def with_compliance(motion: ElasticMotion) -> ElasticMotion:
     """The same motion, of the shape with compliance."""
     shape = motion.shape.compliant
     coefficients = np.zeros(shape.body.modes.shape[-1])
@@ -127,7 +127,7 @@ def _precision_of_forces(near: Residuals, known: int, std_mm: float) -> Float64[
 
 
 @dataclass(frozen=True, eq=False)
-class _Linear:
+class Linear:
     """A Gauss-Newton step's equations at a motion that has ``moved`` from where the prior has the
     pose: of it, and of further cameras' errors; those that neighbours share, and those of tools,
     are marginalised."""
@@ -149,7 +149,7 @@ class _Linear:
         precision: Float64[np.ndarray, "p p"],
         terms: Terms | None,
         scale: float,
-    ) -> _Linear:
+    ) -> Linear:
         """``near``, ``terms``: of the looks' points and evidence, there; ``scale``: of the model's
         error."""
         by_all = np.concatenate([near.by_motion, near.by_cameras], axis=1)
@@ -186,7 +186,7 @@ class _Linear:
         precision: Float64[np.ndarray, "p p"],
         config: GaussNewtonConfig,
         scale: float,
-    ) -> _Linear:
+    ) -> Linear:
         """After a step."""
         count = len(precision)  # the cameras stay
         change = -np.linalg.solve(self.curvature[:count, :count], self.gradient[:count])
@@ -197,7 +197,7 @@ class _Linear:
 
 
 @dataclass(frozen=True, eq=False)
-class _Means:
+class Means:
     """Of groups of neighbouring points, without what lies off the median distance: derivatives and,
     last, distance; how many points each has, and their middle."""
 
@@ -206,7 +206,7 @@ class _Means:
     middles_ct: Float64[np.ndarray, "g 3"]
 
     @classmethod
-    def of(cls, near: Residuals, points_ct: Float64[np.ndarray, "n 3"]) -> _Means:
+    def of(cls, near: Residuals, points_ct: Float64[np.ndarray, "n 3"]) -> Means:
         """``near``: of the points, at a motion by which they are carried back."""
         group, distances = _grouped(points_ct), near.distances_mm
         order = np.lexsort([distances, group])
@@ -230,7 +230,7 @@ class _Means:
 
 
 @dataclass(frozen=True, eq=False)
-class _Groups:
+class Groups:
     """Mean distances of neighbouring points near a fit, and evidence, linear in the unknowns.
 
     Attributes:
@@ -254,11 +254,11 @@ class _Groups:
     def near(
         cls,
         fit: RegistrationResult,
-        of_groups: _Means,
+        of_groups: Means,
         config: GaussNewtonConfig,
         terms: Terms | None,
         scale: float,
-    ) -> _Groups:
+    ) -> Groups:
         """``of_groups``, ``terms``: at the fit's motion, with compliance."""
         body, counts, means = fit.motion.shape.body, of_groups.counts, of_groups.rows
         weights = fit.looks.weight(config) * counts

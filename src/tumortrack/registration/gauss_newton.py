@@ -141,7 +141,8 @@ class GaussNewton:
     """A refinement that can be stopped on its way and continued. ``cost``: of the present state, as
     in ``RegistrationResult``; infinite before the first step. ``steps``: taken so far;
     ``converged``: more would not move it. ``moved``: the start's, as in ``RegistrationResult``;
-    None: the prior has the pose where it starts."""
+    None: the prior has the pose where it starts. ``state``: pose, coefficients and shift, and at
+    them the distances, the curvature and the gradient of the cost."""
 
     def __init__(
         self,
@@ -171,7 +172,7 @@ class GaussNewton:
         rotation, centre_mm, coefficients = (np.array(part, float, order="C") for part in given)
         left = np.empty(count, np.float32), np.empty_like(precision), np.empty(len(precision))
         already = np.zeros(6) if moved is None else np.array(moved, float)
-        self._state = _State(rotation, centre_mm, coefficients, already, *left)
+        self.state = _State(rotation, centre_mm, coefficients, already, *left)
         self.cost, self.steps, self.converged = np.inf, 0, False
         self._terms: Terms | None = None  # of the evidence, at the present state
 
@@ -190,7 +191,7 @@ class GaussNewton:
 
     def _step(self, first: int, last: int) -> None:
         """With the evidence in the equations that it leaves."""
-        state, evidence = self._state, self._looks.evidence
+        state, evidence = self.state, self._looks.evidence
         _, self.converged, cost = self._descend(first, last)
         motion = ElasticMotion(self._rest, state.rotation, state.centre_mm, state.coefficients)
         assert evidence is not None
@@ -214,13 +215,13 @@ class GaussNewton:
             np.empty((unknowns, unknowns)),
             np.empty(unknowns),
         )
-        steps = _descend(self._problem, self._state, room, first, last, ended)
+        steps = _descend(self._problem, self.state, room, first, last, ended)
         if steps < 0:
             raise np.linalg.LinAlgError("the refinement's curvature is not positive definite")
         return steps, bool(ended[0]), float(ended[1])
 
     def result(self) -> RegistrationResult:
-        state = _State._make(part.copy() for part in self._state)
+        state = _State._make(part.copy() for part in self.state)
         covariance = np.linalg.inv(state.curvature)
         placed = state.rotation, state.centre_mm, state.coefficients
         motion = ElasticMotion(self._rest, *placed, covariance)

@@ -67,7 +67,7 @@ def choose_pieces(image: WorkingImage, config: RegionConfig, hints: Hints) -> li
         if folds and wider == 1:
             edges = find_edges(image, config, folds)
         pieces, count = find_pieces(image, edges, config, wider)
-        sizes = _measure(image, edges[1], pieces, count)
+        sizes = measure(image, edges[1], pieces, count)
         poor = _POOR if folds else 1.0  # beside something large a fold may hide the organ in it
         chosen, score, doubtful = _chosen(image, pieces, sizes, config, hints, poor)
         if best is None or score > _CLEARLY * best[0]:
@@ -82,7 +82,7 @@ def choose_pieces(image: WorkingImage, config: RegionConfig, hints: Hints) -> li
         low, high = np.sort(np.asarray(hints.last_box_mm, np.float64), axis=0)
         high[2] -= _FAR_SIDE * (high[2] - low[2])
         box = low - _BOX_MM, high + _BOX_MM
-        area = _area_inside(image, pieces, *box, len(chosen))
+        area = area_inside(image, pieces, *box, len(chosen))
         parts = (area > _WHOLLY * sizes.area_mm2) & (sizes.thick_mm > _THICK_PART_MM) & (area > 0)
         chosen = chosen | parts
     image.remove(~chosen[pieces], PIECES)
@@ -155,7 +155,7 @@ def _hinted(image: WorkingImage, pieces: np.ndarray, sizes: _Sizes, hints: Hints
     if hints.last_box_mm is None:
         return None
     low, high = np.sort(np.asarray(hints.last_box_mm, np.float64), axis=0)
-    area = _area_inside(image, pieces, low, high, len(sizes.cut))
+    area = area_inside(image, pieces, low, high, len(sizes.cut))
     inside = area**2 / np.maximum(sizes.area_mm2, 1e-9)  # the surroundings reach in, too
     return int(inside.argmax()) if inside.max() > 0 else None
 
@@ -169,7 +169,7 @@ def _like_an_organ(sizes: _Sizes, config: RegionConfig) -> np.ndarray:
     return fits * thick * aimed * (1 - 0.95 * sizes.cut) ** 4 * (sizes.wide_mm > low)
 
 
-def _area_inside(
+def area_inside(
     image: WorkingImage, pieces: np.ndarray, low: np.ndarray, high: np.ndarray, count: int
 ) -> np.ndarray:
     """Each piece's area (count,) within a box, mm^2."""
@@ -179,7 +179,7 @@ def _area_inside(
     return area
 
 
-def _measure(image: WorkingImage, distance: np.ndarray, pieces: np.ndarray, count: int) -> _Sizes:
+def measure(image: WorkingImage, distance: np.ndarray, pieces: np.ndarray, count: int) -> _Sizes:
     """``distance``: px to the nearest edge."""
     out = np.empty((count + 1, 17))
     camera = *image.tangents, *image.pinhole[:2]

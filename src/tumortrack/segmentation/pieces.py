@@ -22,13 +22,13 @@ _JUMP = float, float
 _TAKEN = U8["height", "width"]
 
 # Depths, states, jump; which pixels have few neighbours at their depth.
-_isolated = kernel("isolated", DEPTH, _TAKEN, _JUMP, BOOL["height", "width"].out)
+find_isolated = kernel("isolated", DEPTH, _TAKEN, _JUMP, BOOL["height", "width"].out)
 # Depths, states, jump; the remaining depths, with short holes bridged.
-_without_holes = kernel("without_holes", DEPTH, _TAKEN, _JUMP, F32["height", "width"].out)
+bridge_holes = kernel("without_holes", DEPTH, _TAKEN, _JUMP, F32["height", "width"].out)
 # Depths, jump, depth and reach of creases; px to the nearest edge, with a frame of one pixel.
-_edge_distance = kernel("edge_distance", DEPTH, _JUMP, float, float, F32["rows", "columns"].out)
+edge_distances = kernel("edge_distance", DEPTH, _JUMP, float, float, F32["rows", "columns"].out)
 # Depths, pieces, jump, radius; room for a pixel each.
-_grow = kernel("grow", DEPTH, I32["height", "width"].out, _JUMP, float, I32["size"].out)
+grow_pieces = kernel("grow", DEPTH, I32["height", "width"].out, _JUMP, float, I32["size"].out)
 
 
 class Jump(NamedTuple):
@@ -47,7 +47,7 @@ def _jump(image: WorkingImage, config: RegionConfig) -> Jump:
 def remove_flying(image: WorkingImage, config: RegionConfig) -> None:
     """Remove pixels with few neighbours at their depth: between two surfaces, or isolated."""
     isolated = np.empty(image.taken.shape, np.bool_)
-    _isolated(image.depth_mm, image.taken, _jump(image, config), isolated)
+    find_isolated(image.depth_mm, image.taken, _jump(image, config), isolated)
     image.remove(isolated, FLYING)
 
 
@@ -58,11 +58,11 @@ def find_edges(
     (h, w) of every pixel to the nearest edge, px. ``folds``: are edges, too."""
     jump = _jump(image, config)
     depth_mm = np.empty_like(image.depth_mm)
-    _without_holes(image.depth_mm, image.taken, jump, depth_mm)
+    bridge_holes(image.depth_mm, image.taken, jump, depth_mm)
     height, width = depth_mm.shape
     distance = np.empty((height + 2, width + 2), np.float32)
     crease = config.crease_mm * folds, _CREASE_REACH_MM / image.footprint
-    _edge_distance(depth_mm, jump, *crease, distance)
+    edge_distances(depth_mm, jump, *crease, distance)
     return depth_mm, distance[1:-1, 1:-1].copy()
 
 
@@ -76,6 +76,6 @@ def find_pieces(
     depth_mm, distance = edges
     radius = wider * config.opening_mm / image.footprint  # px at distance 1
     pieces, count = label(distance * depth_mm > radius)
-    _grow(depth_mm, pieces, _jump(image, config), radius, np.empty(pieces.size, np.int32))
+    grow_pieces(depth_mm, pieces, _jump(image, config), radius, np.empty(pieces.size, np.int32))
     pieces[image.taken != ORGAN] = 0  # bridged holes
     return pieces, count

@@ -31,7 +31,7 @@ _NARROWEST_MM = 120.0  # extent of a background across its long side
 
 # Points; triples of them, which come from their number; tolerance and greatest depth of an organ;
 # the best plane's normal and offset. Returns its score.
-_consensus = kernel(
+consensus = kernel(
     "plane_consensus",
     *(F32["n", 3].any_value, I64["tries", 3], (float, float), F32[3].out, F64[1].out),
     result=float,
@@ -72,7 +72,7 @@ def find_plane(image: WorkingImage, config: RegionConfig, rng: np.random.Generat
     most_mm = config.plane_mm + 3 * config.noise_mm * float(np.median(points[:, 2]) / 150) ** 2
     triples = rng.integers(len(points), size=(_TRIES, 3))
     normal, offsets = np.zeros(3, np.float32), np.zeros(1)
-    score = _consensus(points, triples, (most_mm, _DEEPEST_MM), normal, offsets)
+    score = consensus(points, triples, (most_mm, _DEEPEST_MM), normal, offsets)
     if score < config.plane_share / 2 * len(points):
         return None
     half_mm, offset = most_mm, float(offsets[0])

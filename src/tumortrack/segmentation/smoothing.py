@@ -39,7 +39,7 @@ _NEIGHBOURS, _RADIUS_MM = (24, 120), 6.0  # a quadratic leaves 0.1 mm of a ball 
 _NOISY_MM = 0.4  # less the fit's ``sigma_mm`` contains, and averaging takes 5 ms of each frame
 
 # Depths; rows and columns, which are some of theirs; reach, relative noise, slope; their depths.
-_smooth_depth = kernel(
+smooth_depth = kernel(
     "smooth_depth",
     *(F32["height", "width"].any_value, I64["rows"], I64["columns"]),
     *(int, float, float, F32["rows", "columns"].out),
@@ -68,9 +68,7 @@ def smoothed(
     relative = noise.whole_mm / noise.depth_mm**2  # of disparities: it grows with the square
     slope = _STEEPEST / frame.intrinsics.fx
     parallel_for(
-        lambda part: _smooth_depth(
-            depth_mm, rows[part], columns, reach, relative, slope, out[part]
-        ),
+        lambda part: smooth_depth(depth_mm, rows[part], columns, reach, relative, slope, out[part]),
         len(rows),
         _AT_ONCE,
     )

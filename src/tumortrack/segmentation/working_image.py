@@ -44,7 +44,7 @@ _cloud_tangents = kernel(
     *(F32["n", 3].any_value, F32["n", 2].out, I64[2, _BINS].out, F64[3, 2].out),
 )
 # Tangents, depths and camera; the image, and each point's pixel.
-_rasterise = kernel(
+rasterise = kernel(
     "rasterise",
     *(F32["n", 2].any_value, F32["n"].any_value, (float,) * 4),
     *(F32["height", "width"].out, I32["n"].out),
@@ -219,7 +219,7 @@ def image_of_cloud(cloud: SensorCloud) -> WorkingImage:
     """A cloud, in any order, as a pinhole camera at its origin sees it: the nearest point in each
     pixel. Points at or behind the camera's centre are left out, and so are occluded ones."""
     points_mm = np.ascontiguousarray(cloud.points_mm)
-    tangents, (low, high, inner) = _tangents(points_mm)
+    tangents, (low, high, inner) = tangents_of(points_mm)
     z = points_mm[:, 2].copy()
     # Stray points widen the image, but don't coarsen it.
     pixels = max(len(points_mm) / _POINTS_PER_PIXEL, 64.0)
@@ -229,7 +229,7 @@ def image_of_cloud(cloud: SensorCloud) -> WorkingImage:
     pinhole = Pinhole(1 / size, 1 / size, float(-low[0] / size), float(-low[1] / size))
     depth_mm = np.full((height, width), np.nan, np.float32)
     pixel = np.empty(len(z), np.int32)
-    _rasterise(tangents, z, pinhole, depth_mm, pixel)
+    rasterise(tangents, z, pinhole, depth_mm, pixel)
     taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
 
     def remaining(taken: np.ndarray) -> np.ndarray:
@@ -240,7 +240,7 @@ def image_of_cloud(cloud: SensorCloud) -> WorkingImage:
     return WorkingImage(depth_mm, taken, pinhole, remaining, lambda index: points_mm[index])
 
 
-def _tangents(points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def tangents_of(points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """x / z and y / z (n, 2), NaN for points behind the camera or too far aside; and (3, 2) their
     minima, maxima, and the spread of the middle 96 %."""
     tangents, ends = np.empty((len(points_mm), 2), np.float32), np.empty((3, 2))

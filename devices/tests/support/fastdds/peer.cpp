@@ -2,7 +2,8 @@
 // as they are, no generated code. Built and run by tests/test_ros2_processes.py.
 //
 //   peer DOMAIN sub SECONDS TOPIC TYPE FILE [TOPIC TYPE FILE ...]
-//       listens; each FILE gets the last message, standard output the numbers of messages
+//       listens until it has heard of each topic, or so long; each FILE gets the last message,
+//       standard output the numbers of messages
 //   peer DOMAIN pub SECONDS HZ TOPIC TYPE FILE [TOPIC TYPE FILE ...]
 //       sends the files' bytes, with the present time as their (first) header's stamp
 // What ends in tf_static is kept for those who come later, sent once, and asked for like that.
@@ -125,7 +126,18 @@ static int listen(DomainParticipant* member, double seconds, int n, char** names
         subscriber->create_datareader(
             topic_of(member, names[i], names[i + 1]), qos, &listeners[i / 3]);
     }
-    std::this_thread::sleep_for(std::chrono::duration<double>(seconds));
+    const auto end = Clock::now() + std::chrono::milliseconds(static_cast<int>(1000 * seconds));
+    bool waits = true;
+    while (waits && Clock::now() < end)
+    {
+        std::this_thread::sleep_for(std::chrono::milliseconds(50));
+        waits = false;
+        for (Listener& one : listeners)
+        {
+            std::lock_guard<std::mutex> guard(one.lock);
+            waits = waits || one.count == 0;
+        }
+    }
     for (int i = 0; i + 2 < n; i += 3)
     {
         Listener& one = listeners[i / 3];
