@@ -50,12 +50,12 @@ $(KERNELS): $(wildcard $(NATIVE)/*.h $(NATIVE)/*/*.[ch]) tools/build_backend.py 
 	@$(NO_COMPILER)
 
 # PyTorch's CPU build is taken where pip knows of it, else PyPI's, which on x86-64 needs CUDA's packages.
-$(SETUP): $(TRACKER) $(KERNELS) devices/pyproject.toml occupancy/pyproject.toml resection/pyproject.toml lab/pyproject.toml experiment/pyproject.toml requirements/rest.txt requirements/cuda.txt requirements/torch-cpu.txt
+$(SETUP): $(TRACKER) $(KERNELS) devices/pyproject.toml occupancy/pyproject.toml resection/pyproject.toml benchmarks/pyproject.toml experiment/pyproject.toml requirements/rest.txt requirements/cuda.txt requirements/torch-cpu.txt
 	@$(BIN)/$(PIP) --require-hashes -r requirements/torch-cpu.txt 2>/dev/null || echo "PyTorch: PyPI's build"
 	@$(call INSTALL,requirements/rest.txt)
 	@if $(BIN)/python -c 'from importlib.metadata import requires; print(requires("torch"))' | grep -q nvidia; then \
 	echo "PyTorch's CUDA packages: some 3 GB"; $(call INSTALL,requirements/cuda.txt); fi
-	$(BIN)/$(PIP) --no-build-isolation -e devices -e occupancy -e resection -e experiment -e lab
+	$(BIN)/$(PIP) --no-build-isolation -e devices -e occupancy -e resection -e experiment -e benchmarks
 	$(BIN)/python -I -m pip check
 	@touch $@
 
@@ -68,9 +68,9 @@ demo: $(TRACKER) $(KERNELS)  ## install the tracker (without PyTorch), then CT -
 	$(BIN)/tumortrack demo $(ARGS)
 
 check: setup  ## lint, types, import order, licences, figures in the pages
-	$(BIN)/ruff check src devices occupancy resection lab experiment tests examples tools notebooks conftest.py
-	$(BIN)/ruff check --select F821 lab/scripts tools tests/support  # mypy does not see these
-	$(BIN)/ruff format --check src devices occupancy resection lab experiment tests examples tools notebooks conftest.py
+	$(BIN)/ruff check src devices occupancy resection benchmarks experiment tests examples tools notebooks conftest.py
+	$(BIN)/ruff check --select F821 benchmarks/scripts tools tests/support  # mypy does not see these
+	$(BIN)/ruff format --check src devices occupancy resection benchmarks experiment tests examples tools notebooks conftest.py
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python tools/dependencies.py licences
@@ -125,34 +125,34 @@ bench: setup  ## speed of every part; fills docs/results.md and docs/data/speed*
 	$(BIN)/tumortrack bench --document docs/results.md $(ARGS)
 
 soak: setup  ## an hour of tracking with faults of eleven kinds (ARGS="MODEL CASE --minutes 5"; after make demo)
-	$(BIN)/python lab/scripts/soak.py $(ARGS)
+	$(BIN)/python benchmarks/scripts/soak.py $(ARGS)
 
-world: setup  ## scenes of wider physics, noise and views, and whether plans cut tumors out of them (ARGS="CASE OUT --plans MODEL")
-	$(BIN)/python lab/scripts/world.py $(ARGS)
+stress: setup  ## scenes of wider physics, noise and views, and whether plans cut tumors out of them (ARGS="CASE OUT --plans MODEL")
+	$(BIN)/python benchmarks/scripts/stress.py $(ARGS)
 
 demo-scenes: setup  ## the ten scenes that the package brings (ARGS=OUT: what takes long is kept there)
-	$(BIN)/python lab/scripts/demo.py $(ARGS)
+	$(BIN)/python benchmarks/scripts/demo.py $(ARGS)
 
 pull: setup  ## an organ under the pull of a plan's holder, for the virtual source (ARGS="PLAN virtual:CASE?... OUT")
-	$(BIN)/python lab/scripts/pull.py $(ARGS)
+	$(BIN)/python benchmarks/scripts/pull.py $(ARGS)
 
 bounds: setup  ## learns how far off organs and tumors may be, from random organs (ARGS="OUT --write src/tumortrack/assessment/bounds.json"; an hour)
-	$(BIN)/python lab/scripts/bounds.py $(ARGS)
+	$(BIN)/python benchmarks/scripts/bounds.py $(ARGS)
 
 evidence: setup  ## what touches, outlines, landmarks and held tumors bring, on random kidneys (ARGS="OUT --kidneys 4"; 10 minutes)
-	$(BIN)/python lab/scripts/evidence.py $(ARGS)
+	$(BIN)/python benchmarks/scripts/evidence.py $(ARGS)
 
 population: setup  ## KiTS19's kidneys with tumors: their list for a fleet, and what came of it (ARGS="DATA --list FILE", then --fleet OUT)
-	$(BIN)/python lab/scripts/population.py $(ARGS)
+	$(BIN)/python benchmarks/scripts/population.py $(ARGS)
 
 noise: setup  ## good answers and tumors' errors against noise, cameras and distances (ARGS="OUT CASE=SCENES ..."; a second an answer)
-	$(BIN)/python lab/scripts/noise.py $(ARGS)
+	$(BIN)/python benchmarks/scripts/noise.py $(ARGS)
 
 rehearsal: setup  ## the experiment on a bench that does not exist, by all its commands (ARGS="CASE MODEL OUT", after make demo)
-	$(BIN)/python lab/scripts/rehearsal.py $(ARGS)
+	$(BIN)/python benchmarks/scripts/rehearsal.py $(ARGS)
 
 pictures: demo debian  ## the pictures in docs/images that the demo shows (docs/maintaining.md has the others; 10 minutes)
-	$(BIN)/python lab/scripts/picture.py runs/demo/case docs/images/demo.png
+	$(BIN)/python benchmarks/scripts/picture.py runs/demo/case docs/images/demo.png
 	$(BIN)/tumortrack locate runs/demo/case runs/demo/dataset/1-rest/cloud.ply --out runs/pictures/run --depth-error 0 --overwrite
 	$(BIN)/tumortrack plan runs/pictures/run runs/pictures/plan --accept-budget --overwrite
 	cp runs/pictures/plan/plan.png docs/images/plan.png
@@ -161,13 +161,13 @@ pictures: demo debian  ## the pictures in docs/images that the demo shows (docs/
 	TUMORTRACK_PICTURES=docs/images TUMORTRACK_DEMO=runs/demo TUMORTRACK_PLAN=runs/pictures/plan $(BIN)/pytest -n0 devices/tests/test_viewer_page.py
 
 wheel: setup $(TOOLS)  ## build the wheels of tracker, devices, the paper's method, resection, experiment and laboratory into dist/, with their dependencies (SBOM)
-	rm -rf dist build/lib devices/build occupancy/build resection/build lab/build experiment/build  # modules that are gone would be packed from there
+	rm -rf dist build/lib devices/build occupancy/build resection/build benchmarks/build experiment/build  # modules that are gone would be packed from there
 	CC=".tools/bin/python -m ziglang cc" $(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist --config-settings portable=1 .
 	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist ./devices ./occupancy ./resection ./experiment ./lab
 	rm -f $(NATIVE)/*.elf && $(MAKE) --no-print-directory $(KERNELS)  # for this machine again
 	.tools/bin/twine check --strict dist/*.whl
 	.tools/bin/auditwheel show dist/tumortrack-*.whl
-	$(BIN)/python tools/dependencies.py sbom dist/tumortrack-*.whl dist/tumortrack_devices-*.whl dist/tumortrack_occupancy-*.whl dist/tumortrack_resection-*.whl dist/tumortrack_experiment-*.whl dist/tumortrack_lab-*.whl
+	$(BIN)/python tools/dependencies.py sbom dist/tumortrack-*.whl dist/tumortrack_devices-*.whl dist/tumortrack_occupancy-*.whl dist/tumortrack_resection-*.whl dist/tumortrack_experiment-*.whl dist/tumortrack_benchmarks-*.whl
 
 lock: setup $(TOOLS)  ## pin the dependencies by hash (ARGS=--upgrade: newest; ARGS="--upgrade-package NAME")
 	PATH="$(CURDIR)/.tools/bin:$$PATH" $(BIN)/python tools/dependencies.py lock $(ARGS)

@@ -20,7 +20,7 @@ PACKAGES = (
     ROOT / "devices" / "src" / "tumortrack_devices",
     ROOT / "occupancy" / "src" / "tumortrack_occupancy",
     ROOT / "resection" / "src" / "tumortrack_resection",
-    ROOT / "lab" / "src" / "tumortrack_lab",
+    ROOT / "benchmarks" / "src" / "tumortrack_benchmarks",
     ROOT / "experiment" / "src" / "tumortrack_experiment",
 )
 
@@ -36,10 +36,10 @@ jaxtyping.install_import_hook(CHECKED, "checking.check_annotations")
 
 
 # What needs a model is slow: it may be the one that makes it.
-MODELS = {"clinic_model", "quick_model", "learnt_model", "slim_model"}
+MODELS = {"elastic_model", "quick_model", "learnt_model", "slim_model"}
 
 # The longest files first: with few workers none is left alone with one at the end. Two of the
-# first three make no `clinic` model: else each worker would compile its kernels for itself.
+# first three make no `elastic` model: else each worker would compile its kernels for itself.
 SLOWEST = (
     "test_soak.py",
     "test_locate.py",
@@ -133,31 +133,31 @@ def phantom_case(once) -> Path:
 
 
 @pytest.fixture(scope="session")
-def clinic_model(once, phantom_case) -> Path:
-    """A model folder of the phantom: the preset clinic."""
-    from stories import write_clinic
+def elastic_model(once, phantom_case) -> Path:
+    """A model folder of the phantom: the preset elastic."""
+    from stories import write_elastic
 
-    return once("clinic_model", lambda model: write_clinic(phantom_case, model))
+    return once("elastic_model", lambda model: write_elastic(phantom_case, model))
 
 
 @pytest.fixture(scope="session")
-def ready_case(once, phantom_case, clinic_model) -> Path:
+def ready_case(once, phantom_case, elastic_model) -> Path:
     """The phantom's case with its model in it."""
 
     def make(case: Path) -> None:
         shutil.copytree(phantom_case, case)
-        shutil.copytree(clinic_model, case / "model")
+        shutil.copytree(elastic_model, case / "model")
 
     return once("ready_case", make)
 
 
 @pytest.fixture
-def models_at_once(monkeypatch, clinic_model) -> list[object]:
+def models_at_once(monkeypatch, elastic_model) -> list[object]:
     """In this process every case's model is the phantom's: none has to be made. The list of cases
     whose model was asked for."""
     from tumortrack.tracking import model_files
 
-    model, asked = model_files.load_model(clinic_model), []
+    model, asked = model_files.load_model(elastic_model), []
 
     def make(case, config=None, seed=0, progress=None):
         asked.append(case)
@@ -186,23 +186,23 @@ def learnt_model(once, phantom_case) -> Path:
 
 @pytest.fixture(scope="session")
 def slim_model(once) -> Path:
-    """A model folder of the elastic objects' organ: a slim clinic."""
+    """A model folder of the elastic objects' organ: a slim elastic."""
     from warp_objects import write_slim
 
     return once("slim_model", write_slim)
 
 
 @pytest.fixture(scope="session")
-def attack_base(request, once, phantom_case, clinic_model) -> Path:
+def attack_base(request, once, phantom_case, elastic_model) -> Path:
     """What attacks and kills start from: a case, a model, a scene; with --attack also a network, a
     run and a plan."""
     from stories import answered, succeeded, tumortrack
 
     def make(base: Path) -> None:
         base.mkdir()
-        (base / "model").symlink_to(clinic_model)
+        (base / "model").symlink_to(elastic_model)
         shutil.copytree(phantom_case, base / "case")
-        shutil.copytree(clinic_model, base / "case" / "model")
+        shutil.copytree(elastic_model, base / "case" / "model")
         succeeded(tumortrack("simulate", base / "case", base / "scenes", "--scenes", 1))
         if not request.config.getoption("--attack"):
             return

@@ -25,7 +25,7 @@ def main(out: Path) -> None:
         surfaces = {}
         for name, part in zip(case.anatomy.names, case.anatomy.parts, strict=True):
             moved = part.vertices_mm @ camera_from_ct[:3, :3].T + camera_from_ct[:3, 3]
-            surfaces[name] = part.moved(moved)
+            surfaces[name] = part.with_vertices(moved)
         return tt.estimate_from_surfaces(surfaces, grid=96)
 
     (errors,) = tt.evaluate(undeformed, out / "scenes", out / "compared").scenes

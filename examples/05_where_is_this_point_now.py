@@ -27,7 +27,7 @@ def main(out: Path) -> None:
     # LPS in, camera frame out, mm. ``std_mm``: one standard deviation along any axis.
     for part, truth in zip(case.anatomy.parts, scene.reference.parts, strict=True):
         points_ct = part.vertices_mm[part.faces[::50]].mean(1)  # middles of triangles
-        now, std = motion.carry(points_ct), motion.std_mm(points_ct)
+        now, std = motion.forward(points_ct), motion.std_mm(points_ct)
         # The scene's true surfaces have the case's triangles, so each one's true place is known.
         true_mm = truth.vertices_mm[truth.faces[::50]].mean(1)
         off = np.linalg.norm(now - true_mm, axis=1)

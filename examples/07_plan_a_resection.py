@@ -19,7 +19,7 @@ CAMERA_FROM_LPS = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # supine, seen
 def main(out: Path) -> None:
     # What `locate` would say if it were right, and the camera looked straight down.
     anatomy = tt.load_case(out / "case").anatomy
-    turned = [part.moved(part.vertices_mm @ CAMERA_FROM_LPS.T) for part in anatomy.parts]
+    turned = [part.with_vertices(part.vertices_mm @ CAMERA_FROM_LPS.T) for part in anatomy.parts]
     seen = tt.estimate_from_surfaces(dict(zip(anatomy.names, turned, strict=True)))
 
     try:  # a tumor that lies wholly inside has no contour to cut along

@@ -31,7 +31,7 @@ def main(out: Path) -> None:
         least_sure = max(estimate.report.tumors, key=lambda n: bounds[n].error_bound95_mm)
         advice = tt.advise(estimate, least_sure)  # estimate.assessment has what pays
         for advised in advice:  # camera frame, mm
-            print(f"next, {advised.words}")
+            print(f"next, {advised.message}")
         for advised in advice:
             if advised.kind == "touch":  # the tip meets the true surface near there
                 away_mm = np.linalg.norm(vertices_mm - advised.place_mm, axis=1)
@@ -49,9 +49,9 @@ def tell(known: str, estimate: tt.Estimate, targets: Any) -> None:
     assert estimate.motion is not None
     for name, bound in estimate.assessment.bounds.items():
         mine = targets.labels == estimate.report.parts[name].label
-        now_mm = estimate.motion.carry(targets.points_ct[mine])
+        now_mm = estimate.motion.forward(targets.points_ct[mine])
         off_mm = np.linalg.norm(now_mm.mean(0) - targets.points_mm[mine].mean(0))
-        print(f"  {name}: its centre is {off_mm:.1f} mm off; stated: {bound.words}")
+        print(f"  {name}: its centre is {off_mm:.1f} mm off; stated: {bound.message}")
 
 
 if __name__ == "__main__":

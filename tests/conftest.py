@@ -18,8 +18,8 @@ def stages():
     """Scenes that no model was calibrated on, of a body with other states."""
     from elastic_objects import UP
     from tumortrack.simulation.scene import SceneRecipe, Simulator, body_for
-    from warp_objects import ANATOMY, slim_clinic
+    from warp_objects import ANATOMY, slim_elastic
 
-    config = slim_clinic().scene
+    config = slim_elastic().scene
     simulator = Simulator(ANATOMY, UP, config, body_for(ANATOMY, UP, config, 77))
     return [simulator.render(SceneRecipe(5, "test", index)) for index in range(8)]

@@ -24,7 +24,7 @@ from tumortrack.core import store
 from tumortrack.core.cloud import CloudConfig
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.evidence import Held, Landmark, Outline, Touch
+from tumortrack.core.evidence import Grasp, Landmark, Outline, Touch
 from tumortrack.core.geometry import plane_section
 from tumortrack.core.report import FitReport
 from tumortrack.core.types import SensorCloud
@@ -68,7 +68,9 @@ def measured(report: FitReport) -> dict[str, float]:
     known, cost = [std_mm for std_mm in deviations if std_mm is not None], report.fit_cost
     values = {
         "fit_cost": None if cost is None else cost.now / cost.usual,
-        "rarity": None if report.motion is None else report.motion.rarity,
+        "normalized_mahalanobis": None
+        if report.motion is None
+        else report.motion.normalized_mahalanobis,
         "unseen": report.unseen,
         "seen_through": report.seen_through,
         "unsure_mm": max(known, default=None),
@@ -86,7 +88,7 @@ def record(locate: Callable[[], Estimate], points_mm: np.ndarray) -> Numbers:
         return {**numbers, "verdict": f"none: {error.finding.kind if error.finding else ''}"}
     report, organ = estimate.report, phantom().anatomy.organ.vertices_mm
     assert estimate.motion is not None
-    places = [estimate.motion.carry(organ[:: len(organ) // PLACES][:PLACES])]
+    places = [estimate.motion.forward(organ[:: len(organ) // PLACES][:PLACES])]
     places += [[part.center_mm] for part in report.tumors.values() if part.center_mm]
     bounds = {name: each.error_bound95_mm for name, each in estimate.assessment.bounds.items()}
     return {
@@ -124,7 +126,7 @@ def of_image(number: int) -> Numbers:
 
     def locate() -> Estimate:
         region = organ_points(frame, REGION, Hints(), np.random.default_rng(0))
-        return tracker().locate(region.cloud, grid=32, seen=frame)
+        return tracker().locate(region.cloud, grid=32, full_view=frame)
 
     return record(locate, seen_mm)
 
@@ -161,7 +163,7 @@ def drawn(scene: Scene, kind: str, rng: np.random.Generator) -> Sequence[Any]:
     )
     if kind == "landmarks":
         return [Landmark(point_ct=tuple(a), place_mm=b, std_mm=1.0) for a, b in pairs]
-    return [Held(point_ct=tuple(a), place_mm=b, std_mm=1.0) for a, b in pairs]
+    return [Grasp(point_ct=tuple(a), place_mm=b, std_mm=1.0) for a, b in pairs]
 
 
 @cache

@@ -30,7 +30,7 @@ LOCKS = ROOT / "requirements"
 TABLE = ROOT / "docs" / "data" / "dependencies.csv"
 OWN = [
     "tumortrack",
-    *(f"tumortrack-{n}" for n in ("devices", "occupancy", "resection", "lab", "experiment")),
+    *(f"tumortrack-{n}" for n in ("devices", "occupancy", "resection", "benchmarks", "experiment")),
 ]
 _APART = {"ur-rtde": "ur"}  # in a file of its own: `make setup` leaves it out
 
@@ -42,7 +42,7 @@ ALLOWED = {
     "Zlib",
 }  # fmt: skip
 # What packages say that say it otherwise.
-SAID = {
+MESSAGES = {
     "apache software license": "Apache-2.0", "apache 2.0": "Apache-2.0",
     "apache license 2.0": "Apache-2.0", "apache license, version 2.0": "Apache-2.0",
     "bsd license": "BSD", "3-clause bsd license": "BSD-3-Clause", "isc license (iscl)": "ISC",
@@ -205,7 +205,7 @@ def licence(package: Distribution) -> str:
     classifiers = about.get_all("Classifier") or []
     classes = [text.split(" :: ")[-1] for text in classifiers if text.startswith("License :: ")]
     words = classes or [str(about.get("License") or "").strip().partition("\n")[0]]
-    names = [SAID.get(word.lower(), word) for word in words]
+    names = [MESSAGES.get(word.lower(), word) for word in words]
     return " AND ".join(dict.fromkeys(filter(None, names)))
 
 

@@ -1,6 +1,6 @@
 """Do the pages say what the tables say, and are the tables of today's method?
 
-python tools/figures.py           fill the pages from docs/data (tumortrack_lab.document has
+python tools/figures.py           fill the pages from docs/data (tumortrack_benchmarks.document has
                                   the format); exit status 1 where a table is of another method
 python tools/figures.py --check   write nothing; exit status 1 also where a page differs
 """
@@ -18,7 +18,7 @@ from tumortrack.assessment.fingerprint import fingerprint
 from tumortrack.core import renamed, store
 from tumortrack.core.errors import InputError
 from tumortrack.simulation.sensors import FIGURES, simulated
-from tumortrack_lab.document import MeasuredTable, rendered, table_of
+from tumortrack_benchmarks.document import MeasuredTable, rendered, table_of
 
 _RENAMED = re.compile(r"(<!-- renamed -->\n).*?(<!-- /renamed -->)", re.DOTALL)
 _WHERE = {  # by section of renamed.toml

@@ -21,7 +21,7 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 from tumortrack.cli.main import run
-from tumortrack_lab.document import MeasuredTable
+from tumortrack_benchmarks.document import MeasuredTable
 
 ROOT = Path(__file__).parents[1]
 TAKEN_IN = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changes.md"}

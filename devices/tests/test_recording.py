@@ -34,8 +34,8 @@ from refused import refused
 from tumortrack.core import store
 from tumortrack.core.camera import d405
 from tumortrack.core.errors import InputError, StorageError
-from tumortrack.core.evidence import Free, Held, Landmark, Outline, Touch
-from tumortrack.core.geometry import HERE, rigid
+from tumortrack.core.evidence import FreeSpace, Grasp, Landmark, Outline, Touch
+from tumortrack.core.geometry import IDENTITY, rigid
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.io.mesh_files import write_anatomy
 from tumortrack.io.ply import write_cloud_ply
@@ -113,10 +113,10 @@ def test_evidence_comes_back_with_its_frame_and_its_camera_to_the_last_bit(tmp_p
     place, many = (1 / 3, np.pi, 1e3 / 7), ((0.1, 0.2, 130.3), (1e-9, -2 / 3, 99.0))
     one = (
         Touch(place_mm=place, part="tumor_1", tip_mm=1.5, stamp_ns=STAMP_NS - 7, tool="probe"),
-        Held(point_ct=place, place_mm=place, point_std_mm=2 / 3, tool="grasper"),
+        Grasp(point_ct=place, place_mm=place, point_std_mm=2 / 3, tool="grasper"),
         Outline(places_mm=many, part="tumor_2"),
     )
-    other = (Free(places_mm=many, tip_mm=4.0), Landmark(point_ct=place, place_mm=place))
+    other = (FreeSpace(places_mm=many, tip_mm=4.0), Landmark(point_ct=place, place_mm=place))
     known = one, (), other
     updates = [replace(update_number(n), evidence=each) for n, each in enumerate(known)]
     got = play(record(tmp_path / "r", updates))
@@ -144,7 +144,7 @@ def test_evidence_comes_back_with_its_frame_and_its_camera_to_the_last_bit(tmp_p
 )
 def test_damaged_evidence_costs_its_frame_alone(text, tmp_path, monkeypatch):
     updates = [update_number(n) for n in range(3)]
-    updates[1] = replace(updates[1], evidence=(Free(places_mm=((0.0, 0.0, 90.0),)),))
+    updates[1] = replace(updates[1], evidence=(FreeSpace(places_mm=((0.0, 0.0, 90.0),)),))
     damaging = SimpleNamespace(json=SimpleNamespace(encode=lambda _: text.encode()))
     monkeypatch.setattr("tumortrack_devices.recording.mcap.msgspec", damaging)
     bad = record(tmp_path / "r", updates)
@@ -484,7 +484,7 @@ def test_a_recorded_bag_keeps_the_name_of_its_camera(tmp_path, published, name, 
 
 
 def test_a_recording_of_a_moving_camera_keeps_its_poses(tmp_path):
-    published = PublishedFrame("base", HERE, calibrated=True, moves=True)
+    published = PublishedFrame("base", IDENTITY, calibrated=True, moves=True)
     told, _ = played([Tape(0, 33, 66, 99)], Led(), published)
     context = replace(small_setting(), published_frame=published)
     sink = RecordingSinkConfig(path=tmp_path / "run").open(context)
@@ -534,7 +534,7 @@ def test_a_recording_its_length_rate_and_whether_its_depths_were_corrected(tmp_p
     for n in range(12):  # the last one ends a chunk
         depth = DepthFrame(np.full((240, 424), 150.0, np.float32), d405(424, 240), 10**18 + n)
         seen = Observation(depth, 10**18 + n * 10**8)
-        bag.write(seen.arrived_ns, camera_messages(seen, HERE, "camera", messages))
+        bag.write(seen.arrived_ns, camera_messages(seen, IDENTITY, "camera", messages))
     if ended:
         bag.close()
     patient = {"id": "P1", "side": "left"}

@@ -41,7 +41,7 @@ from workcell_objects import with_arms, working
 
 needs.module("cyclonedds", "tumortrack-devices, x86-64, Python up to 3.13")
 
-HERE = Path(__file__).parent / "support"
+IDENTITY = Path(__file__).parent / "support"
 
 
 @pytest.fixture(autouse=True)
@@ -168,12 +168,12 @@ class Sender(Frames):
         return until(got, "a frame")
 
     def refused(
-        self, source: Source, seen: Observation, this: str, beside: Observation | None = None
+        self, source: Source, seen: Observation, this: str, extra_status: Observation | None = None
     ) -> None:
         """Until it is refused for ``this``."""
         for _ in range(100):
-            if beside is not None:
-                self.send(beside, ("depth/image_rect",))
+            if extra_status is not None:
+                self.send(extra_status, ("depth/image_rect",))
             try:
                 self.until(source, seen)
             except InputError as error:
@@ -231,7 +231,7 @@ def test_the_view_for_rviz_shows_what_is_published(
     name: str, frame: str, topics: list[str], messages: Messages
 ) -> None:
     """Topics, frame and reliability of the views are the sink's."""
-    folder = HERE.parents[1] / "integrations" / "ros2" / "tumortrack_ros" / "rviz"
+    folder = IDENTITY.parents[1] / "integrations" / "ros2" / "tumortrack_ros" / "rviz"
     view = (folder / name).read_text(encoding="utf-8")
     out = ResultMessages(messages, with_arms()).of(empty_update())
     sent = {one.topic("/tumortrack") for one in out}

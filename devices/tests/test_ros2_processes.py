@@ -57,7 +57,7 @@ from tumortrack_devices.sources.ros import Ros2SourceConfig as SourceRos2
 
 needs.module("cyclonedds", "tumortrack-devices, x86-64, Python up to 3.13")
 
-HERE = Path(__file__).parent / "support"
+IDENTITY = Path(__file__).parent / "support"
 CLOUD_DDS = "sensor_msgs::msg::dds_::PointCloud2_"
 TURNED = rigid(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([50.0, -20, 300]))
 SHIFTED = rigid(np.diag([1.0, -1, -1]), np.array([0.0, 10, 60]))
@@ -284,7 +284,7 @@ def built(folder: Path) -> tuple[Path, dict[str, str]]:
     if not shutil.which("g++"):
         needs.missing("g++ is not installed: make debian")
     made, found = folder / "peer", [f"-I{clients.FOLDER}/include", f"-L{clients.FOLDER}/lib"]
-    sources = ["-std=c++17", "-O0", *found, str(HERE / "fastdds" / "peer.cpp"), "-o", str(made)]
+    sources = ["-std=c++17", "-O0", *found, str(IDENTITY / "fastdds" / "peer.cpp"), "-o", str(made)]
     libraries = ["-lfastrtps", "-lfastcdr", "-Wl,--unresolved-symbols=ignore-in-shared-libs"]
     subprocess.run(["g++", *sources, *libraries], check=True, timeout=600)
     return made, environment

@@ -48,7 +48,7 @@ PACKAGE = Path(__file__).parents[1] / "integrations" / "ros2" / "tumortrack_ros"
 
 
 def sent(results: ResultMessages, update: TrackingResult) -> dict:
-    return {one.suffix: one.message for one in results.of(update)}
+    return {one.suffix: one.message for one in results.messages(update)}
 
 
 def estimate_with(update: TrackingResult, meshes: dict[str, Mesh], **report: object) -> Estimate:

@@ -290,7 +290,7 @@ def test_what_was_seen_comes_back(messages):
 
 def by_suffix(update, results: ResultMessages | None = None):
     results = results or ResultMessages(HUMBLE, small_setting())
-    return {out.suffix: out.message for out in results.of(update)}
+    return {out.suffix: out.message for out in results.messages(update)}
 
 
 def headers_of(message) -> list:

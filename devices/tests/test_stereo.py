@@ -91,9 +91,9 @@ def test_pictures_of_another_size_are_refused(seen, unchecked):
 
 
 @pytest.mark.slow
-def test_the_organ_is_located_by_it(seen, clinic_model):
+def test_the_organ_is_located_by_it(seen, elastic_model):
     """The model learnt for seconds, and for a D405; only the unevenness to expect is stereo's."""
-    model = api.load_model(clinic_model, "cpu")
+    model = api.load_model(elastic_model, "cpu")
     scene = msgspec.structs.replace(model.config.scene, noise=STEREO_NOISE)
     model = replace(model, config=msgspec.structs.replace(model.config, scene=scene))
     assert region_for(model).noise_mm == STEREO_NOISE.axial_mm
@@ -207,14 +207,14 @@ def test_what_the_right_camera_does_not_see_is_lost():
 
 def test_a_preset_s_scenes_can_be_those_of_stereo(phantom_case):
     anatomy = load_case(phantom_case).anatomy
-    clinic = presets.clinic(anatomy)
-    assert presets.seen_by(clinic, "d405") == clinic
-    stereo = presets.seen_by(clinic, "stereo")
+    elastic = presets.elastic(anatomy)
+    assert presets.seen_by(elastic, "d405") == elastic
+    stereo = presets.seen_by(elastic, "stereo")
     assert stereo.scene.noise == STEREO_NOISE != D405_NOISE
-    assert msgspec.structs.replace(stereo.scene, noise=D405_NOISE) == clinic.scene
-    clean = msgspec.structs.replace(clinic.scene, noise=CLEAN)
+    assert msgspec.structs.replace(stereo.scene, noise=D405_NOISE) == elastic.scene
+    clean = msgspec.structs.replace(elastic.scene, noise=CLEAN)
     with pytest.raises(InputError):
-        presets.seen_by(msgspec.structs.replace(clinic, scene=clean), "stereo")
+        presets.seen_by(msgspec.structs.replace(elastic, scene=clean), "stereo")
 
 
 NARROW = endoscope(320, 240, 260.0)

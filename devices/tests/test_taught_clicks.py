@@ -119,11 +119,11 @@ def test_clicks_teach_the_running_loop(slim_model):
                 if sum(one.organ is organ for one in context.controls.clicks) < 3:
                     click(viewer, visitor, scene.frame, pixel, organ)
             if organ:
-                assert context.controls.taught is None
+                assert context.controls.tissue_classifier is None
 
     def forgetting():
         until(lambda: shown(10))
-        assert context.controls.taught is not None
+        assert context.controls.tissue_classifier is not None
         assert viewer.panel.colour.content
         assert viewer.panel.forget.visible
         visitor.change("Forget")
@@ -176,7 +176,7 @@ def organ_error_mm(scene, result):
         return 100.0
     at_rest = ANATOMY.organ.vertices_mm
     true = transform_points(scene.camera_from_organ, at_rest)
-    return np.linalg.norm(result.estimate.motion.carry(at_rest) - true, axis=1).mean()
+    return np.linalg.norm(result.estimate.motion.forward(at_rest) - true, axis=1).mean()
 
 
 def test_what_teaches_nothing_is_said_and_changes_nothing():
@@ -190,6 +190,6 @@ def test_what_teaches_nothing_is_said_and_changes_nothing():
         with pytest.raises(InputError):
             controls.click(replace(seen, picture=picture_), np.array([0.0, 0.0, 125.0]), True)
     assert controls.clicks == ()
-    assert controls.taught is None
+    assert controls.tissue_classifier is None
     controls.forget()
     assert (controls.clicks, controls.colour, controls.picked_mm) == ((), "", None)

@@ -22,7 +22,7 @@ from refused import refused
 from rtde_arm import RtdeArm
 from tumortrack.core.assessment import NOT_JUDGED
 from tumortrack.core.errors import InputError
-from tumortrack.core.evidence import Free, Held, Landmark, Outline, Touch
+from tumortrack.core.evidence import FreeSpace, Grasp, Landmark, Outline, Touch
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.live.poses import COLUMNS, CONTACT, pose_row
 from tumortrack.live.tools import Tools
@@ -141,7 +141,7 @@ def test_the_tip_and_the_shaft_follow_the_tools_axes(tmp_path):
     tool = FileToolConfig(path=path, **options).open(setting(), "probe")
     free, touch = sorted(frames(tool, [200])[0], key=lambda piece: piece.name)
     np.testing.assert_allclose(touch.place_mm, (80, 0, 120), atol=1e-6)
-    assert isinstance(free, Free)
+    assert isinstance(free, FreeSpace)
     assert free.tip_mm == 4
     np.testing.assert_allclose(free.places_mm, [(x, 0, 120) for x in (75, 70, 65, 60)], atol=1e-6)
     bare = FileToolConfig(path=path, shaft_mm=10.0).open(setting(), "probe")
@@ -166,10 +166,10 @@ class Shifted:
     def __init__(self, shift_mm):
         self.shift_mm = np.array(shift_mm, float)
 
-    def carry(self, points):
+    def forward(self, points):
         return points + self.shift_mm
 
-    def back(self, points):
+    def inverse(self, points):
         return points - self.shift_mm
 
     def std_mm(self, points):
@@ -192,7 +192,7 @@ def test_what_is_held_is_the_point_of_the_ct_that_was_taken_until_it_is_let_go(t
     # In the frame at 120 ms it was told what it has; from the next one on it says so.
     assert [time for time, pieces in given.items() if pieces] == list(range(160, 500, 40))
     for time_ms, (held,) in ((t, p) for t, p in given.items() if p):
-        assert isinstance(held, Held)
+        assert isinstance(held, Grasp)
         np.testing.assert_allclose(held.point_ct, (0.2 * 12, 0, 6), atol=1e-6)
         np.testing.assert_allclose(held.place_mm, (0.02 * time_ms, 0, 106), atol=1e-6)
         assert (held.point_std_mm, held.std_mm, held.tool) == (2, 1, "grasper")

@@ -22,8 +22,8 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
-def world(phantom_case, clinic_model):
-    return World(phantom_case, clinic_model)
+def world(phantom_case, elastic_model):
+    return World(phantom_case, elastic_model)
 
 
 def reports(recording):

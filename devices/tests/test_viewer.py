@@ -43,10 +43,10 @@ class Turned:
 
     camera_from_ct: np.ndarray
 
-    def carry(self, points_ct: np.ndarray, /) -> np.ndarray:
+    def forward(self, points_ct: np.ndarray, /) -> np.ndarray:
         return transform_points(self.camera_from_ct, points_ct)
 
-    def back(self, points_camera: np.ndarray, /) -> np.ndarray:
+    def inverse(self, points_camera: np.ndarray, /) -> np.ndarray:
         return transform_points(np.linalg.inv(self.camera_from_ct), points_camera)
 
     def std_mm(self, points_ct: np.ndarray, /) -> None:
@@ -85,7 +85,7 @@ def carried_update(case: Case, motion: Turned = MOTION) -> TrackingResult:
     assert update.estimate is not None
     names = ("kidney", "tumor_1")
     meshes = {
-        name: part.moved(motion.carry(part.vertices_mm))
+        name: part.with_vertices(motion.forward(part.vertices_mm))
         for name, part in zip(names, case.anatomy.parts, strict=True)
     }
     return replace(update, estimate=replace(update.estimate, meshes=meshes, motion=motion))
@@ -147,12 +147,12 @@ def test_slice_shows_the_ct_where_it_is_now(with_ct):
     case = sloped_case(with_ct)
     ct = CarriedCt(case)
     across, down = np.array([1.0, 0, 0]), np.array([0, 0.6, 0.8])
-    plane = SlicePlane(MOTION.carry(np.array([[2.0, 1.0, 0.0]]))[0], across, down, 24.0)
+    plane = SlicePlane(MOTION.forward(np.array([[2.0, 1.0, 0.0]]))[0], across, down, 24.0)
     picture = slice_picture(ct, MOTION, plane, [], 48)
     assert picture is not None
     rows, columns = (axis.ravel() for axis in np.mgrid[3:36:6, 2:46:7])  # the bar is below
     x, y = (columns - 23.5) / 2, (rows - 23.5) / 2  # mm from the middle
-    places = MOTION.back(plane.centre_mm + np.outer(x, across) + np.outer(y, down))
+    places = MOTION.inverse(plane.centre_mm + np.outer(x, across) + np.outer(y, down))
     expected = ct.picture(places).astype(int)
     assert np.ptp(expected) > 60
     close = np.abs(picture[rows, columns].astype(int) - expected).max(1) <= 3
@@ -185,7 +185,7 @@ def test_labels_have_their_parts_colours_and_nothing_is_round_them():
 def test_slice_outlines_lie_on_the_surface():
     case = sloped_case()
     tumor = ball((8, 0, 0), 6.0)
-    there = tumor.moved(MOTION.carry(tumor.vertices_mm))
+    there = tumor.with_vertices(MOTION.forward(tumor.vertices_mm))
     middle = there.box_mm.mean(0)
     plane = SlicePlane(middle, np.array([1.0, 0, 0]), np.array([0, 1.0, 0]), 32.0)
     picture = slice_picture(CarriedCt(case), MOTION, plane, [(there, (0, 255, 0), 1)], 128)
@@ -336,7 +336,7 @@ def test_case_gives_slices_and_an_exact_margin_that_moves_along(sinks, clock, tm
     picture = sink.panel.slice.image
     assert (np.abs(picture.astype(int) - TUMORS[0]).sum(2) < 90).sum() > 30  # its outline
     shell = sink.server.scene.get_handle_by_name("/estimate/margin_tumor_1").vertices
-    middle = MOTION.carry(np.array([[8.0, 0, 0]]))[0]
+    middle = MOTION.forward(np.array([[8.0, 0, 0]]))[0]
     assert np.linalg.norm(shell - middle, axis=1) == pytest.approx(11.0, abs=0.35)
     sink.publish(empty_update())
     assert not sink.panel.slice.visible
@@ -428,7 +428,8 @@ def test_keys_and_buttons_say_that_a_tool_touches_and_the_panel_how_much_is_know
         until(lambda: len(setting.controls.touched) == 2, "the touches")
     assert [*setting.controls.touched] == ["grasper", "probe"]
     said = [
-        EvidenceReport(name="touch", off_mm=0.1, news=0.2, left_out=out) for out in (False, True)
+        EvidenceReport(name="touch", off_mm=0.1, information_gain=0.2, rejected=out)
+        for out in (False, True)
     ]
     update = small_update()
     sink.publish(replace(update, estimate=reporting(update.estimate, evidence=tuple(said))))

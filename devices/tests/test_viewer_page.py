@@ -199,7 +199,7 @@ def test_banner_and_panel_leave_room_for_each_other_at_every_size(patient):
     """On a phone, a laptop and a large screen, with a reason longer than any. What lies below the
     numbers does not jump."""
     shown = small_update()
-    touch = {"name": "touch", "off_mm": 0.1, "news": 0.2, "left_out": False}
+    touch = {"name": "touch", "off_mm": 0.1, "information_gain": 0.2, "rejected": False}
     sure = bounded(shown.estimate, tumor_1=1.9, tumor_2=1.9)
     states = {
         "GOOD": replace(shown, estimate=reporting(sure, evidence=[touch])),

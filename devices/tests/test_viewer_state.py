@@ -27,7 +27,7 @@ def _seen(number: int, aside_mm: float, quality: Quality) -> TrackingResult:
     update = small_update(number)
     assert update.estimate is not None
     meshes = {
-        name: mesh.moved(mesh.vertices_mm + [aside_mm, 0, 0])
+        name: mesh.with_vertices(mesh.vertices_mm + [aside_mm, 0, 0])
         for name, mesh in update.estimate.meshes.items()
     }
     warning = "it fits badly" if quality == "poor" else ""

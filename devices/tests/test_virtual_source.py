@@ -116,14 +116,14 @@ def test_breathing_goes_down_the_body_and_back():
 def _in_room(theatre: ScenePlayer, t_s: float) -> np.ndarray:
     instant = theatre.state_at(t_s)
     center = theatre.anatomy_ct.organ.vertices_mm.mean(0)[None]
-    before = theatre.carry(instant, center)
+    before = theatre.forward(instant, center)
     return transform_points(np.linalg.inv(instant.camera_from_room), before)
 
 
 def test_nothing_jumps_between_frames():
     theatre = small_theatre()
     places = [
-        theatre.carry(theatre.state_at(t_s), theatre.anatomy_ct.organ.vertices_mm[::20])
+        theatre.forward(theatre.state_at(t_s), theatre.anatomy_ct.organ.vertices_mm[::20])
         for t_s in np.arange(0, ROUND_S + 1, 1 / 30)
     ]
     steps_mm = [np.linalg.norm(b - a, axis=1).max() for a, b in pairwise(places)]
@@ -161,7 +161,7 @@ def _by_rays(
     )
     shaft = rod(SHAFT_MM, 200.0)
     camera_from_rod = camera_from_room @ theatre.state_at(t_s).room_from_rod
-    shaft = shaft.moved(transform_points(camera_from_rod, shaft.vertices_mm))
+    shaft = shaft.with_vertices(transform_points(camera_from_rod, shaft.vertices_mm))
     hits = [
         np.concatenate(
             [ray_hits(np.zeros(3), part, mesh).min(1) for part in np.array_split(rays, 10)]

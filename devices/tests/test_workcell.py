@@ -28,7 +28,7 @@ NAMES = [shape.name for shape in workcell().shapes]
 
 def sent(update: TrackingResult, results: ResultMessages | None = None) -> dict:
     results = results or ResultMessages(HUMBLE, with_arms())
-    return {out.suffix: out.message for out in results.of(update)}
+    return {out.suffix: out.message for out in results.messages(update)}
 
 
 def less(update: TrackingResult, *names: str) -> TrackingResult:

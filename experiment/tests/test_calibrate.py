@@ -56,7 +56,7 @@ def corners_of(look, lens, rng, deviation_px=0.08):
     return Corners(on_mm[shown], pixels[shown] + rng.normal(0, deviation_px, (shown.sum(), 2)))
 
 
-def robot_looks(count, rng, tilt_degrees=35.0, off_mm=0.05, off_degrees=0.02):
+def robot_views(count, rng, tilt_degrees=35.0, off_mm=0.05, off_degrees=0.02):
     """``base_from_tool``, as a robot that errs says it, and ``camera_from_board``."""
     looks = looks_at_board(BOARD, count, rng, (130, 250), tilt_degrees)
     exact = [BOARD_AT @ np.linalg.inv(look) @ np.linalg.inv(CAMERA_AT) for look in looks]
@@ -140,7 +140,7 @@ def test_distortion_is_fitted_only_where_there_is_any(lens, model):
 def test_the_stated_bound_holds():
     rng, within = np.random.default_rng(2), []
     for _ in range(3):
-        poses, looks = robot_looks(10, rng)
+        poses, looks = robot_views(10, rng)
         places = [LENS.place(corners_of(look, LENS, rng))[0] for look in looks]
         data = HandEyeData(poses, np.array(places))
         found, said, _ = solve(data, list(map(str, range(10))), 150.0, 1e-4)
@@ -152,7 +152,7 @@ def test_the_stated_bound_holds():
 def hand(tmp_path_factory):
     """Pictures of the board by a camera on a tool, and the tool's poses."""
     rng = np.random.default_rng(3)
-    poses, looks = robot_looks(9, rng)
+    poses, looks = robot_views(9, rng)
     tmp_path = tmp_path_factory.mktemp("hand")
     (tmp_path / "seen").mkdir()
     for n, look in enumerate(looks):
@@ -259,14 +259,14 @@ def faulty(poses, looks, fault):
 
 @pytest.mark.parametrize("fault", ["metres", "few", "order", "size", "one axis", "small"])
 def test_poses_that_do_not_determine_the_camera_are_refused_with_what_to_do(fault):
-    poses, looks, named = faulty(*robot_looks(12, np.random.default_rng(6)), fault)
+    poses, looks, named = faulty(*robot_views(12, np.random.default_rng(6)), fault)
     data = HandEyeData(poses, np.array(looks))
     with refused(InputError, named):
         solve(data, list(map(str, range(len(looks)))), 150.0)
 
 
 def test_a_picture_of_another_moment_is_named_and_left_out():
-    poses, looks = robot_looks(14, np.random.default_rng(7))
+    poses, looks = robot_views(14, np.random.default_rng(7))
     poses[5] = poses[5] @ rigid(np.eye(3), np.array([0, 6.0, 0]))
     names = [f"shot_{n}" for n in range(14)]
     found, said, warnings = solve(HandEyeData(poses, np.array(looks)), names, 150.0, 1e-4)

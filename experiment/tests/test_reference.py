@@ -187,7 +187,7 @@ def test_a_state_that_the_ct_does_not_show_is_noticed(made):
     def at(stretch, shift=(0, 0, 0)):
         organ = case.anatomy.organ
         rest = transform_points(bench.BASE_FROM_CT, organ.vertices_mm)
-        return organ.moved(transform_points(POSE, rest * stretch + shift))
+        return organ.with_vertices(transform_points(POSE, rest * stretch + shift))
 
     right = scenes.check_surface(view, others, at(bench.STRETCH), cloud)
     assert right["p95_mm"] < 1.5

@@ -17,8 +17,8 @@ from stories import answered, cloud_by_rays, looking_down, refusal, succeeded, t
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import FollowOptions
-from tumortrack.core.geometry import HERE, transform_points
-from tumortrack.core.types import Anatomy, Look, SensorCloud
+from tumortrack.core.geometry import IDENTITY, transform_points
+from tumortrack.core.types import Anatomy, SensorCloud, View
 from tumortrack.io.case import load_case
 from tumortrack.io.mesh_files import read_mesh
 from tumortrack.report.inspection import describe
@@ -142,7 +142,7 @@ def test_following_does_not_gather_memory(tracker, seen):
     points = seen[0].astype(np.float32)
     for n in range(90):
         cloud = SensorCloud(rng.permutation(points)[: 600 + 4 * n], n)
-        last = tracker.follow(cloud, last, FollowOptions(thorough=n % 30 == 0))
+        last = tracker.follow(cloud, last, FollowOptions(global_search=n % 30 == 0))
         pages.append(int(STATM.read_text().split()[1]))
     grown_mb = (np.median(pages[-10:]) - np.median(pages[30:40])) * 4096 / 1e6
     assert grown_mb < 30  # a kernel for every number of queries would take 100
@@ -204,7 +204,7 @@ def test_clouds_in_other_formats_and_units_agree(work, seen, out):
 def test_the_estimate_does_not_depend_on_the_arithmetic(tracker, seen, bfloat16):
     cloud, usual = SensorCloud(seen[0]), tracker.locate(SensorCloud(seen[0]), grid=32).report
     locator = OccupancyLocator(tracker.model, bfloat16)
-    forced = locator.locate([Look(cloud, cloud, HERE)], 32, 0).report
+    forced = locator.locate([View(cloud, cloud, IDENTITY)], 32, 0).report
     for name in tracker.model.parts:
         apart = np.subtract(forced.parts[name].center_mm, usual.parts[name].center_mm)
         assert np.linalg.norm(apart) < 1.0
@@ -214,7 +214,7 @@ def test_the_estimate_does_not_depend_on_the_arithmetic(tracker, seen, bfloat16)
 def test_a_method_that_knows_no_motion_takes_one_look():
     cloud = SensorCloud(np.zeros((300, 3)) + [0, 0, 130])
     with pytest.raises(InputError):
-        OccupancyLocator.locate(None, [Look(cloud, cloud, HERE)] * 2, 16, 0)
+        OccupancyLocator.locate(None, [View(cloud, cloud, IDENTITY)] * 2, 16, 0)
 
 
 def test_smoothing_needs_a_model_with_a_motion(phantom_case, quick_model, tmp_path):
@@ -282,7 +282,7 @@ def test_an_organ_deformed_as_never_in_training_is_not_refused(tracker, work, di
         along = part.vertices_mm[:, 2] - case.anatomy.organ.box_mm.mean(0)[2]
         bent = part.vertices_mm.copy()
         bent[:, 0] += distance_mm * (np.maximum(along, 0) / 55) ** 2
-        parts.append(part.moved(bent))
+        parts.append(part.with_vertices(bent))
     bent_case = replace(case, anatomy=Anatomy(tuple(parts)))
     for spin in (0.0, 130.0):
         points = cloud_by_rays(bent_case, looking_down(bent_case, spin_degrees=spin), step=0.012)

@@ -111,7 +111,7 @@ def test_labels_travel_through_a_deformation(pool, steps, changes):
     oracle = np.zeros(len(moved), np.uint8)
     clear = np.full(len(moved), np.inf)
     for label, part in enumerate(ANATOMY.parts, start=1):
-        deformed = part.moved(drags.apply(part.vertices_mm))
+        deformed = part.with_vertices(drags.apply(part.vertices_mm))
         oracle[winding_number(deformed, moved) > 0.5] = label
         clear = np.minimum(clear, surface_distance(deformed, moved))
     sure = clear > 0.3

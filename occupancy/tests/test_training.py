@@ -271,7 +271,7 @@ def test_a_refused_run_leaves_nothing_behind(case, tmp_path):
     run = a_run(case)
     needle = run.anatomy_ct.organ.vertices_mm.mean(0) + run.anatomy_ct.tumors[0].vertices_mm * 1e-4
     needle[:, 0] *= 1e-3
-    thin = Anatomy((run.anatomy_ct.organ, run.anatomy_ct.tumors[0].moved(needle)))
+    thin = Anatomy((run.anatomy_ct.organ, run.anatomy_ct.tumors[0].with_vertices(needle)))
     with pytest.raises(InputError):
         train(replace(run, anatomy_ct=thin), tmp_path / "model", lambda _: None)
     assert not (tmp_path / "model").exists()

@@ -176,7 +176,7 @@ def test_what_nobody_states_is_assumed_and_named():
     rows = [line.split() for line in planned_budgets(planned(), bound)[0].table()]
     assert ["hand-eye", "2.0", "assumed"] in rows
     assert [row[0] for row in rows[1:]] == [*TERMS, "together"]
-    assert rows[1] == ["tracking", "4.5", *ErrorBound(4.53).words.split()]
+    assert rows[1] == ["tracking", "4.5", *ErrorBound(4.53).message.split()]
     assert ["tracking", "8.0", "assumed"] in [line.split() for line in bare.table()]
     (poor,) = planned_budgets(planned(), replace(bound, doubt="it is seen through"))
     assert (poor.tracking_mm, "tracking" in poor.assumed) == (4.53, True)

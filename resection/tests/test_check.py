@@ -161,8 +161,8 @@ def test_it_agrees_with_a_slow_check(solid, off_mm):
     cloud_mm = trimesh.remesh.subdivide_to_size(tumor.vertices_mm, tumor.faces, 0.5)[0]
     # The least is not where the axis is farther from the ellipsoid's middle than its shape allows.
     points_mm = np.einsum("sk,nkc->nsc", np.linspace([1, 0], [0, 1], 60), ends_mm)
-    apart_mm = np.linalg.norm(points_mm - tumor.box_mm.mean(0), axis=2).min(1)
-    likely = ends_mm[apart_mm < apart_mm.min() + np.ptp(half_mm) + one.radius_mm + 1]
+    distance_mm = np.linalg.norm(points_mm - tumor.box_mm.mean(0), axis=2).min(1)
+    likely = ends_mm[distance_mm < distance_mm.min() + np.ptp(half_mm) + one.radius_mm + 1]
     slow_mm = min(signed_mm(tumor, cloud_mm, ends, one.radius_mm) for ends in likely)
     found = of(clearances(URDF, motions, {"tumor_1": tumor}, ()), solid)
     assert found.least_mm == pytest.approx(slow_mm, abs=0.05)
@@ -247,9 +247,9 @@ def test_what_is_carried_moves_with_the_holder_from_the_lift_on():
     assert (found.stage, found.at_s) == ("lift", pytest.approx(1.0, abs=0.05))
     assert np.linalg.norm(np.array(found.place_mm) - target) < 7
     still = of(clearances(URDF, Motions((resting, lifting)), parts, ()))
-    apart_mm = of(clearances(URDF, Motions((resting,)), parts, ["tumor_1"])).least_mm
-    assert still.least_mm == pytest.approx(apart_mm)
-    assert apart_mm > 20
+    distance_mm = of(clearances(URDF, Motions((resting,)), parts, ["tumor_1"])).least_mm
+    assert still.least_mm == pytest.approx(distance_mm)
+    assert distance_mm > 20
     # Before the lift, nothing is carried.
     coming = stage("grasp", turned("holder_shoulder_pan_joint", 0.2), HOME)
     found = of(clearances(URDF, Motions((coming, resting, lifting)), parts, ["tumor_1"]))
@@ -259,7 +259,7 @@ def test_what_is_carried_moves_with_the_holder_from_the_lift_on():
     unmoved = of(clearances(URDF, Motions((coming,)), parts, ()), "cup")
     assert arriving.least_mm == pytest.approx(unmoved.least_mm, abs=2e-3)
     moved = Motions((stage("pull", HOME, up),))
-    assert of(clearances(URDF, moved, parts, ["tumor_1"])).least_mm == pytest.approx(apart_mm)
+    assert of(clearances(URDF, moved, parts, ["tumor_1"])).least_mm == pytest.approx(distance_mm)
 
 
 def test_cutting_and_not_cutting_are_told_apart():

@@ -70,10 +70,10 @@ def cases(draw: st.DrawFn, most_tumors: int = 2, most_facets: int = 6) -> Case:
         parts.append(draw(tumors(half_mm, (5, 9))))
     angles = [draw(between(-180, 180)), draw(between(-40, 40)), draw(between(-40, 40))]
     turn = Rotation.from_euler("zyx", angles, degrees=True).as_matrix()
-    parts = [part.moved(part.vertices_mm @ turn.T) for part in parts]
+    parts = [part.with_vertices(part.vertices_mm @ turn.T) for part in parts]
     low = min(float(part.box_mm[0, 2]) for part in parts)
     shift = [draw(between(-30, 30)), draw(between(-30, 30)), 120.0 - low]
-    parts = [part.moved(part.vertices_mm + shift) for part in parts]
+    parts = [part.with_vertices(part.vertices_mm + shift) for part in parts]
     asked = len(parts) > 2 and draw(st.booleans())
     kept = {"tumor_2": draw(between(1, 6))} if asked else {}
     config = ResectionConfig(
@@ -92,7 +92,7 @@ def cases(draw: st.DrawFn, most_tumors: int = 2, most_facets: int = 6) -> Case:
         organ_clearance_mm=draw(between(2, 5)),
     )
     located = located_of(*parts, n=8_000)
-    assume(all(len(located.of(n)) for n in located.tumors))  # none is hidden in the other
+    assume(all(len(located.points_of(n)) for n in located.tumors))  # none is hidden in the other
     return Case(located, config, cell)
 
 
@@ -217,7 +217,7 @@ def test_motions_of_another_organ_are_refused():
         b_from_a = np.eye(4)
         b_from_a[:3, 3] = 3.0 * plane[:3]
         with refused(NoPlan, "tumor_1"):
-            checked(plan, motions, URDF, located.moved(b_from_a))
+            checked(plan, motions, URDF, located.transformed(b_from_a))
 
 
 def test_a_cell_with_another_electrode_is_not_taken_for_this_one():

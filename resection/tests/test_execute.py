@@ -69,7 +69,7 @@ def test_an_abort_stops_the_arms_smoothly_from_every_state_and_for_good(state):
     run_until(execution, state)
     execution.step(0.3)
     joints = [execution.joints_rad]
-    execution.abort(Halt("stopped", {"words": "the surgeon said so"}))
+    execution.abort(Halt("stopped", {"message": "the surgeon said so"}))
     assert execution.state == Stage.ABORTED
     for _ in range(200):
         execution.step(0.005)
@@ -195,7 +195,7 @@ class World:
 
     def locate(self, update):
         meshes = {
-            name: mesh.moved(mesh.vertices_mm + self.shifts.get(name, self.shift))
+            name: mesh.with_vertices(mesh.vertices_mm + self.shifts.get(name, self.shift))
             for name, mesh in self.located.meshes.items()
         }
         return replace(self.located, points_mm=self.located.points_mm + self.shift, meshes=meshes)
@@ -275,7 +275,7 @@ def test_every_doubt_halts_the_arms_and_they_go_on_after_it(state, doubt, kind):
     world.until(state)
     cell = world.frames(15, **doubt)
     assert cell.halt.kind == kind
-    assert cell.halt.values["words"] in doubt.values()
+    assert cell.halt.values["message"] in doubt.values()
     still = world.frame(**doubt)
     assert still.joints_rad == cell.joints_rad
     assert plain(still) == state
@@ -451,7 +451,7 @@ def test_arms_stand_while_the_errors_exceed_the_margin_and_go_on_when_they_shrin
         "term": "tracking", "term_mm": 12.0,
     }  # fmt: skip
     assert cell.left_mm < 0
-    assert cell.stopped == cell.halt.words
+    assert cell.stopped == cell.halt.message
     assert all(words and words in cell.line for words in (cell.state, cell.stopped, cell.note))
     changes = off_by(12.5)
     worse = world.frame(**changes)
@@ -508,7 +508,7 @@ def test_where_no_new_plan_can_be_made_the_arms_stop_for_good_and_say_why():
         if cell.state == Stage.ABORTED:
             break
     assert cell.state == Stage.ABORTED
-    assert (cell.halt.kind, cell.halt.values["words"]) == ("no_plan", "the holder can't reach it")
+    assert (cell.halt.kind, cell.halt.values["message"]) == ("no_plan", "the holder can't reach it")
     assert world.operation.ended
 
 
@@ -554,9 +554,9 @@ def test_what_a_new_plan_warns_of_is_said_with_every_state_from_then_on():
 
 
 def test_surfaces_of_other_triangles_are_compared_by_their_distance():
-    from tumortrack_resection.operation import apart_mm
+    from tumortrack_resection.operation import distance_mm
 
     a, b = sphere(TUMOR_MM, RADIUS_MM), sphere(TUMOR_MM + [3.0, 4.0, 0.0], RADIUS_MM, finer=3)
-    assert 2.0 < apart_mm(a, b) < 5.0  # between the surfaces, some of which slide
-    assert apart_mm(a, sphere(TUMOR_MM, RADIUS_MM, finer=3)) < 0.7
-    assert apart_mm(a, a.moved(a.vertices_mm + [0, 0, 2.0])) == pytest.approx(2.0)
+    assert 2.0 < distance_mm(a, b) < 5.0  # between the surfaces, some of which slide
+    assert distance_mm(a, sphere(TUMOR_MM, RADIUS_MM, finer=3)) < 0.7
+    assert distance_mm(a, a.with_vertices(a.vertices_mm + [0, 0, 2.0])) == pytest.approx(2.0)

@@ -45,7 +45,7 @@ def turned(seen: Located, vector: tuple[float, float, float]) -> Located:
     b_from_a = np.eye(4)
     b_from_a[:3, :3] = Rotation.from_rotvec(vector).as_matrix()
     b_from_a[:3, 3] = MIDDLE_MM - b_from_a[:3, :3] @ MIDDLE_MM
-    return seen.moved(b_from_a)
+    return seen.transformed(b_from_a)
 
 
 def beside(middle_mm, radius_mm=5.0) -> Located:
@@ -126,7 +126,7 @@ def test_volumes_are_those_of_the_surfaces(name):
     inner = (beyond(plan.facets, points) <= -RADIUS).all(1)
     assert (contains(plan.piece, points) == (contains(seen.organ, points) & inner)).mean() > 0.999
     # Shares are counted with the points of the cloud.
-    count = len(seen.of(1))
+    count = len(seen.points_of(1))
     healthy_ml = plan.piece.volume_ml - taken_ml
     assert ml["healthy"] == pytest.approx(healthy_ml, abs=counted_to(ml, healthy_ml, count))
     points = np.random.default_rng(4).uniform(*seen.organ.box_mm, (60_000, 3))
@@ -198,11 +198,11 @@ def apart(gap_mm: float, other_mm: float = 12.0) -> Located:
     return located(sphere(one, 7.0), large, n=20_000)
 
 
-@pytest.mark.parametrize(("apart_mm", "share"), [(11.0, 0.5), (9.0, 0.2)])
-def test_where_there_is_little_room_it_keeps_less_and_the_plan_says_so(apart_mm, share):
+@pytest.mark.parametrize(("distance_mm", "share"), [(11.0, 0.5), (9.0, 0.2)])
+def test_where_there_is_little_room_it_keeps_less_and_the_plan_says_so(distance_mm, share):
     """An electrode fits between the two, but not with both margins; out with both would come four
     times as much."""
-    seen = apart(apart_mm)
+    seen = apart(distance_mm)
     plan = plan_resection(seen, ResectionConfig(tumor="tumor_1"))
     assert plan.taken == ("tumor_1",)
     assert plan.keep_mm == {"tumor_2": pytest.approx(share * OURS.margin_mm)}

@@ -12,20 +12,20 @@ from tumortrack_resection.halt import CUT_NOTE, Halt, HaltKind
 
 def test_halts_that_differ_in_numbers_alone_are_the_same():
     first, second = (Halt("moved", {"part": "tumor_1", "off_mm": mm}) for mm in (2.04, 13.0))
-    assert first.words == "tumor_1 has moved by 2.0 mm"
+    assert first.message == "tumor_1 has moved by 2.0 mm"
     assert first != second
     assert first.same_as == second.same_as
     assert first.words_without_numbers == second.words_without_numbers
     cut = msgspec.structs.replace(first, cut=True)
-    assert CUT_NOTE in cut.words
+    assert CUT_NOTE in cut.message
     for other in (Halt("moved", {"part": "kidney", "off_mm": 2.04}), cut, Halt("planning")):
         assert other.same_as != first.same_as
     once, again = (
-        Halt("no_estimate", {"words": finding.words}, finding)
+        Halt("no_estimate", {"message": finding.message}, finding)
         for finding in (Finding("no_frame", {"seconds": s}) for s in (0.6, 1.9))
     )
     assert once.same_as == again.same_as
-    assert once.words == "no estimate: no frame for 0.6 s"
+    assert once.message == "no estimate: no frame for 0.6 s"
 
 
 def test_every_kind_has_one_sentence():

@@ -16,7 +16,7 @@ from tumortrack.core.report import Finding
 from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.live.values import PublishedFrame
-from tumortrack_lab.world.cut import cut as cut_out
+from tumortrack_benchmarks.physics.cut import cut as cut_out
 from tumortrack_resection.budget import planned_budgets
 from tumortrack_resection.drafts import exophytic_shares, plan_resection
 from tumortrack_resection.files import as_builtins, from_plain
@@ -80,7 +80,7 @@ def test_points_without_an_area_have_no_outline(points):
 
 def test_the_published_plan_is_the_papers():
     seen = located()
-    tumor = seen.of(2)
+    tumor = seen.points_of(2)
     plan = plan_resection(seen, PUBLISHED)
     assert plan.tumor == "tumor_1"
     assert plan.grasp_mm == pytest.approx([*tumor[:, :2].mean(0), tumor[:, 2].max()])
@@ -110,7 +110,7 @@ def test_the_published_piece_is_the_organ_over_the_lower_sweep_within_its_contou
     outline = shapely.Polygon(plan.cuts[1].path_mm[:, :2])
     points = np.random.default_rng(0).uniform(*seen.organ.box_mm, (20_000, 3))
     within = shapely.contains_xy(outline, *points[:, :2].T) & (
-        points[:, 2] > seen.of(2)[:, 2].min()
+        points[:, 2] > seen.points_of(2)[:, 2].min()
     )
     organ = contains(seen.organ, points)
     assert (contains(plan.piece, points) == (within & organ)).mean() > 0.998

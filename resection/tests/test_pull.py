@@ -89,7 +89,9 @@ class Procedure:
         self.operation = Operation(planned, config, draw, Following(self.locate, replan, grip=grip))
 
     def locate(self, update):
-        meshes = {n: m.moved(m.vertices_mm + self.shift_mm) for n, m in LOCATED.meshes.items()}
+        meshes = {
+            n: m.with_vertices(m.vertices_mm + self.shift_mm) for n, m in LOCATED.meshes.items()
+        }
         return replace(LOCATED, meshes=meshes)
 
     def frame(self, update=None):
@@ -230,7 +232,7 @@ def test_what_is_taut_is_cut_along_the_same_facets_where_it_lies_now(taut, monke
     )
     here = next(stage.joints_rad[-1] for stage in made.stages if stage.name == Stage.TAUT)
     up_mm = PULL_MM * plan.lift
-    meshes = {n: mesh.moved(mesh.vertices_mm + up_mm) for n, mesh in LOCATED.meshes.items()}
+    meshes = {n: mesh.with_vertices(mesh.vertices_mm + up_mm) for n, mesh in LOCATED.meshes.items()}
     pulled = replace(LOCATED, points_mm=LOCATED.points_mm + up_mm, meshes=meshes)
     anew = arms_procedure.replan(pulled, here, ResectionProgress(holds=True), plan)
     assert [stage.name for stage in anew.motions.stages] == [s.name for s in made.stages[5:]]

@@ -63,7 +63,9 @@ def write_run(folder, tumors=(TUMOR,), doubt=None, **bounds_mm):
     """What `locate` would write of these tumors, the camera straight above."""
     organ = located(*tumors, n=20_000)
     camera = {
-        name: mesh.moved(mesh.vertices_mm @ CAMERA_FROM_TABLE[:3, :3].T + CAMERA_FROM_TABLE[:3, 3])
+        name: mesh.with_vertices(
+            mesh.vertices_mm @ CAMERA_FROM_TABLE[:3, :3].T + CAMERA_FROM_TABLE[:3, 3]
+        )
         for name, mesh in organ.meshes.items()
     }
     points = organ.points_mm @ CAMERA_FROM_TABLE[:3, :3].T + CAMERA_FROM_TABLE[:3, 3]
@@ -614,14 +616,14 @@ def test_with_a_calibration_plan_and_arms_are_in_the_robots_frame(story, tmp_pat
     ("method", "warned"), [("published", (CUTS_TUMOR, OVER_BUDGET)), ("margin", (OVER_BUDGET,))]
 )
 def test_a_live_world_that_lies_elsewhere_is_planned_anew_and_cut(
-    phantom_case, clinic_model, tmp_path, method, warned
+    phantom_case, elastic_model, tmp_path, method, warned
 ):
     case = load_case(phantom_case)
     cloud = cloud_by_rays(case, looking_down(case))
     write_cloud_ply(tmp_path / "cloud.ply", cloud)
     answered(
         tumortrack(
-            "locate", clinic_model, tmp_path / "cloud.ply", "--out", tmp_path / "run", "--grid", 32
+            "locate", elastic_model, tmp_path / "cloud.ply", "--out", tmp_path / "run", "--grid", 32
         )
     )
     command = ("plan", tmp_path / "run", tmp_path / "plan", "--method", method)
@@ -630,7 +632,7 @@ def test_a_live_world_that_lies_elsewhere_is_planned_anew_and_cut(
     report = tmp_path / "report.json"
     output = succeeded(
         tumortrack(
-            "resect", tmp_path / "plan", "--live", clinic_model, world, "--speed", 10,
+            "resect", tmp_path / "plan", "--live", elastic_model, world, "--speed", 10,
             "--report", report, "--replan-cut",
         )
     )  # fmt: skip

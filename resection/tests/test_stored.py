@@ -298,7 +298,7 @@ def test_motions_that_were_edited_to_come_nearer_to_the_tumor_are_not_carried_ou
 
 
 def moved_to(name, mesh, place_mm):
-    there = mesh.moved(mesh.vertices_mm - mesh.box_mm.mean(0) + place_mm)
+    there = mesh.with_vertices(mesh.vertices_mm - mesh.box_mm.mean(0) + place_mm)
     return lambda folder: write_mesh(folder / f"{name}.ply", there)
 
 
@@ -378,12 +378,14 @@ def lying(shift_mm, parts=("kidney", "tumor_1", "tumor_2")):
     """The organ, or these parts of it alone, elsewhere."""
     shift_mm = np.array(shift_mm)
     meshes = {
-        name: mesh.moved(mesh.vertices_mm + shift_mm * (name in parts))
+        name: mesh.with_vertices(mesh.vertices_mm + shift_mm * (name in parts))
         for name, mesh in LOCATED.meshes.items()
     }
     structures = LOCATED.structures
     if "kidney" in parts:
-        structures = {n: mesh.moved(mesh.vertices_mm + shift_mm) for n, mesh in structures.items()}
+        structures = {
+            n: mesh.with_vertices(mesh.vertices_mm + shift_mm) for n, mesh in structures.items()
+        }
     labels = [
         n for n, name in enumerate(("kidney", "tumor_1", "tumor_2"), start=1) if name in parts
     ]

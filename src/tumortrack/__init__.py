@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from tumortrack.assessment.advice import advise as advise
     from tumortrack.core import errors as errors
     from tumortrack.core.estimate import Estimate as Estimate
-    from tumortrack.core.evidence import Free as Free
-    from tumortrack.core.evidence import Held as Held
+    from tumortrack.core.evidence import FreeSpace as FreeSpace
+    from tumortrack.core.evidence import Grasp as Grasp
     from tumortrack.core.evidence import Landmark as Landmark
     from tumortrack.core.evidence import Outline as Outline
     from tumortrack.core.evidence import Touch as Touch
     from tumortrack.core.types import DepthFrame as DepthFrame
     from tumortrack.core.types import Intrinsics as Intrinsics
-    from tumortrack.core.types import Look as Look
     from tumortrack.core.types import SensorCloud as SensorCloud
+    from tumortrack.core.types import View as View
     from tumortrack.io.case import Case as Case
     from tumortrack.io.case import load_case as load_case
     from tumortrack.report.inspection import describe as describe
@@ -38,12 +38,12 @@ if TYPE_CHECKING:
 
 _NAMES = {  # by the module that has them
     "api": "estimate_from_surfaces evaluate export find_organ load_estimate load_model locate "
-    "locate_files prepare read_cloud read_depth scan_phantom simulate_scenes teach "
-    "track train write_scenes",
+    "locate_files prepare read_cloud read_depth scan_phantom simulate_scenes "
+    "track train train_tissue_classifier write_scenes",
     "core": "errors",
     "core.estimate": "Estimate",
-    "core.evidence": "Free Held Landmark Outline Touch",
-    "core.types": "DepthFrame Intrinsics Look SensorCloud",
+    "core.evidence": "FreeSpace Grasp Landmark Outline Touch",
+    "core.types": "DepthFrame Intrinsics View SensorCloud",
     "io.case": "Case load_case",
     "report.inspection": "describe",
     "report.results": "Evaluation TrackSummary",

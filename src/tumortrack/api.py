@@ -23,7 +23,7 @@ from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.evidence import CAMERA, Evidence
-from tumortrack.core.types import DepthFrame, Look, Mesh, SensorCloud
+from tumortrack.core.types import DepthFrame, Mesh, SensorCloud, View
 from tumortrack.io.case import Case
 from tumortrack.io.case import load_case as load_case
 from tumortrack.tracking.keywords import (
@@ -99,7 +99,7 @@ def prepare(
     from tumortrack.case import prepare as preparing
     from tumortrack.case.options import PrepareOptions
     from tumortrack.io.case import KIND, save_case
-    from tumortrack.io.model_folder import weakness_of
+    from tumortrack.io.model_folder import reliability_warning
     from tumortrack.tracking.model_files import case_model
 
     asked = options_from(PrepareOptions, {**options}, "prepare")
@@ -122,7 +122,7 @@ def prepare(
             save_case(case, aside)
         case = load_case(folder)
         model = case_model(case, progress=progress)
-        if weakness := weakness_of(model.provenance):
+        if weakness := reliability_warning(model.provenance):
             case = _warning_in_picture(case, weakness, model)
     return case
 
@@ -132,7 +132,7 @@ def _draw_case(case: Case, folder: Path, weakness: str = "") -> None:
     from tumortrack.report.pictures import qc_picture
 
     doubts = [
-        *(found.words for found in case.warnings),
+        *(found.message for found in case.warnings),
         case.report["half_turn"]["warning"],
         weakness,
     ]
@@ -204,9 +204,9 @@ def write_scenes(
     asked = options_from(SimulateOptions, {**options}, "write_scenes")
     made_of = load_case(case)
     inside = Path(folder).iterdir() if Path(folder).is_dir() else ()
-    if strays := [p.name for p in inside if p.name[0] != "." and not (p / "meta.json").is_file()]:
+    if outliers := [p.name for p in inside if p.name[0] != "." and not (p / "meta.json").is_file()]:
         raise InputError(
-            f"{folder} also holds {', '.join(sorted(strays)[:3])}, which are no scenes. Choose "
+            f"{folder} also holds {', '.join(sorted(outliers)[:3])}, which are no scenes. Choose "
             "another folder, or an empty one."
         )
     config = asked.scene_config().seen_whole(made_of.anatomy)
@@ -235,7 +235,7 @@ def train(
     case: StrPath | Case,
     folder: StrPath,
     *,
-    preset: Literal["clinic", "quick", "paper"] = "clinic",
+    preset: Literal["elastic", "quick", "paper"] = "elastic",
     config: ModelConfig | None = None,
     rotations: Literal["limited", "full"] | None = None,
     sensor: Literal["d405", "stereo"] | None = None,
@@ -248,15 +248,15 @@ def train(
     report: Callable[[TrainingStatus], None] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Model:
-    """A model of its own folder. The default preset, ``clinic``, has nothing to learn: a case holds
-    its model. For ``quick`` and ``paper`` (of tumortrack-occupancy) the same call resumes after
-    Ctrl-C or a crash. Raises InputError, ArtifactError: no case, an option is not allowed, a part
-    is too small to be learnt, or ``folder`` holds another model or run.
+    """A model of its own folder. The default preset, ``elastic``, has nothing to learn: a case
+    holds its model. For ``quick`` and ``paper`` (of tumortrack-occupancy) the same call resumes
+    after Ctrl-C or a crash. Raises InputError, ArtifactError: no case, an option is not allowed, a
+    part is too small to be learnt, or ``folder`` holds another model or run.
 
     Args:
         case: or the folder that ``prepare`` wrote.
         folder: the model's, to write.
-        preset: ``clinic`` registers the organ of the CT, ``quick`` and ``paper`` label points.
+        preset: ``elastic`` registers the organ of the CT, ``quick`` and ``paper`` label points.
         config: a changed preset instead: ``msgspec.structs.replace(presets.quick(anatomy), ...)``.
         rotations: of the preset: how the organ may lie (default: as the case says; ``quick`` and
             ``paper``: limited).
@@ -287,7 +287,7 @@ def train(
         raise InputError("rotations and sensor are a preset's; a configuration says them itself.")
     known = case if isinstance(case, Case) else load_case(case)
     check_trainable(Path(folder))
-    if isinstance(config, RegistrationConfig) or (config is None and preset == "clinic"):
+    if isinstance(config, RegistrationConfig) or (config is None and preset == "elastic"):
         known = replace(
             known, rotations=rotations or known.rotations, sensor=sensor or known.sensor
         )
@@ -350,7 +350,7 @@ def find_organ(
     mask: Bool[np.ndarray, "h w"] | None = None,
     picked_mm: Float[np.ndarray, " 3"] | None = None,
     picture: UInt8[np.ndarray, "h w *rgb"] | None = None,
-    taught: TissueClassifier | None = None,
+    tissue_classifier: TissueClassifier | None = None,
     seed: int = 0,
 ) -> SensorCloud:
     """The organ's points among table, drape, instruments and hands; camera frame, mm.
@@ -361,8 +361,8 @@ def find_organ(
         box_mm: two opposite corners of a region of interest.
         mask: of a depth image, True where the organ may be.
         picked_mm: a point on the organ: the piece that it lies on is taken.
-        picture: grey, or red, green and blue, in the depth image's pixels; for ``taught``, what
-            ``teach`` says of organ and surroundings.
+        picture: grey, or red, green and blue, in the depth image's pixels; for
+            ``tissue_classifier``, what ``train_tissue_classifier`` says of organ and surroundings.
 
     Raises:
         NoEstimate: nothing is left that may be the organ, and which step took the rest; or what
@@ -382,14 +382,14 @@ def find_organ(
             "find_organ(frame, model=load_case(FOLDER))."
         )
     region = region_for(model, range_mm=range_mm, box_mm=box_mm)
-    hints = Hints(mask, picked_mm, None, picture, taught)
+    hints = Hints(mask, picked_mm, None, picture, tissue_classifier)
     found = organ_points(content, region, hints, np.random.default_rng(seed))
     if found.doubt:
         raise NoEstimate(found.doubt)
     return found.cloud
 
 
-def teach(
+def train_tissue_classifier(
     frame: DepthFrame,
     picture: UInt8[np.ndarray, "h w *rgb"],
     organ: Sequence[tuple[int, int]],
@@ -401,16 +401,18 @@ def teach(
     from tumortrack.segmentation import tissue
 
     pixels = [(pixel, True) for pixel in organ] + [(pixel, False) for pixel in beside]
-    return tissue.teach([tissue.sample_click(frame, picture, *pixel) for pixel in pixels])
+    return tissue.train_tissue_classifier(
+        [tissue.sample_click(frame, picture, *pixel) for pixel in pixels]
+    )
 
 
 def locate(
     case: Case | Model | StrPath,
     points: SensorCloud | Float[np.ndarray, "n 3"],
     *,
-    views: Sequence[Look] = (),
+    views: Sequence[View] = (),
     evidence: Sequence[Evidence] = (),
-    seen: DepthFrame | SensorCloud | None = None,
+    full_view: DepthFrame | SensorCloud | None = None,
     grid: int = 160,
     seed: int = 0,
     frame: str = CAMERA,
@@ -430,7 +432,13 @@ def locate(
     cloud = cloud_of(points)  # what is wrong is said before a model is loaded
     tracker = Tracker(load_model(case, device) if isinstance(case, str | Path) else case)
     return tracker.locate(
-        cloud, views=views, evidence=evidence, seen=seen, grid=grid, seed=seed, frame=frame
+        cloud,
+        views=views,
+        evidence=evidence,
+        full_view=full_view,
+        grid=grid,
+        seed=seed,
+        frame=frame,
     )
 
 
@@ -510,13 +518,13 @@ def evaluate(
 
     Returns:
         Per scene and part Hausdorff distances, surface and centre distance (mm), IoU, target
-        errors, and for a tracker of a `clinic` model those of the best rigid pose and of a rigid
+        errors, and for a tracker of a `elastic` model those of the best rigid pose and of a rigid
         fit; ``parts`` and ``errors`` have medians, and the worst with its scene.
         docs/conventions.md defines each.
     """
     from tumortrack.report import protocol
+    from tumortrack.report.baselines import baselines_of
     from tumortrack.report.results import evaluation
-    from tumortrack.report.rivals import rivals_of
     from tumortrack.report.summary import summarise
     from tumortrack.tracking.tracker import Tracker
 
@@ -536,17 +544,20 @@ def evaluate(
             written = protocol.evaluate_model(locate, folder, out, grid, seed, device, step)
             return evaluation(written)
         call: Any = getattr(locate, "locate", locate)
-        rivals = rivals_of(getattr(locate, "model", None))
-        return evaluation(protocol.evaluate_scenes(call, folder, out, step, rivals=rivals))
+        baselines = baselines_of(getattr(locate, "model", None))
+        return evaluation(protocol.evaluate_scenes(call, folder, out, step, baselines=baselines))
     if not scenes:
         raise InputError("there are no scenes to evaluate: simulate_scenes(case, 20) makes some.")
     if isinstance(locate, Path):
         locate = Tracker(load_model(locate, device))
-    call, rivals = getattr(locate, "locate", locate), rivals_of(getattr(locate, "model", None))
+    call, baselines = (
+        getattr(locate, "locate", locate),
+        baselines_of(getattr(locate, "model", None)),
+    )
     if isinstance(locate, Tracker):
         call = partial(call, grid=grid, seed=seed)
     named = ((f"{n:04d}", scene) for n, scene in enumerate(scenes))
-    entries = [protocol.evaluate_scene(call, scene, name, rivals)[0] for name, scene in named]
+    entries = [protocol.evaluate_scene(call, scene, name, baselines)[0] for name, scene in named]
     return evaluation({"scenes": entries, "summary": summarise(entries)})
 
 

@@ -16,7 +16,7 @@ from tumortrack.assessment.causes import where_to_look
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import rigid, transform_points
-from tumortrack.core.types import Look, OccupancyCloud, SensorCloud
+from tumortrack.core.types import OccupancyCloud, SensorCloud, View
 from tumortrack.registration.motion import ElasticMotion
 from warp_objects import ANATOMY, shape
 
@@ -65,7 +65,7 @@ def test_what_another_camera_saw_is_not_hidden():
     there = SensorCloud(transform_points(np.linalg.inv(aside), rest.points_mm.astype(float)))
     unsure = estimate([side[0], side[1], 0], (12 * side[0], 12 * side[1], 0))
     assert towards in where_to_look(unsure, looked(first))
-    said = where_to_look(unsure, [*looked(first), Look(there, there, aside)])
+    said = where_to_look(unsure, [*looked(first), View(there, there, aside)])
     assert said == "look more from another side, by about 30 degrees"
 
 
@@ -84,14 +84,14 @@ LYING = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # the organ's long axis,
 def test_a_look_along_the_least_sure_axis_tells_most(words):
     side = np.array([*SIDES[next(name for name in SIDES if f"the {words} (" in name)], 0.0])
     fit = ElasticMotion(shape(), LYING, CENTRE, shape().body.mean)
-    looks = list(Advisor(unsure_along(side, fit), 1).looks())
-    best = min(looks, key=lambda look: look.then_std_mm)
+    views = list(Advisor(unsure_along(side, fit), 1).views())
+    best = min(views, key=lambda view: view.then_std_mm)
     assert abs(np.array(best.direction) @ side) > 0.45  # 30 degrees from the line of sight
     assert best.std_mm == pytest.approx(3.0, rel=0.01)
     assert best.then_std_mm < 1.2
     found = estimate([0, 0, 1], motion=unsure_along(side, fit))
-    vertices = fit.carry(ANATOMY.organ.vertices_mm)
-    found.meshes["kidney"] = ANATOMY.organ.moved(vertices)
+    vertices = fit.forward(ANATOMY.organ.vertices_mm)
+    found.meshes["kidney"] = ANATOMY.organ.with_vertices(vertices)
     other = {"left": "right", "right": "left", "top": "bottom"}[words]
     said = where_to_look(found, looked(SensorCloud(vertices)))
     assert any(f"look more from the {side} (" in said for side in (words, other))
@@ -102,8 +102,8 @@ def test_a_touch_where_another_fit_differs_tells_most():
     mean, end_mm = shape().body.mean, CENTRE + [48.0, 0, 0]
     turn = Rotation.from_euler("z", 25, degrees=True).as_matrix()
     other = ElasticMotion(shape(), turn @ LYING, end_mm + turn @ (CENTRE - end_mm), mean)
-    fit = ElasticMotion(shape(), LYING, CENTRE, mean, rivals=((other, 0.4),))
-    fit = replace(unsure_along(np.array([1.0, 0, 0]), fit), rivals=fit.rivals)
+    fit = ElasticMotion(shape(), LYING, CENTRE, mean, alternatives=((other, 0.4),))
+    fit = replace(unsure_along(np.array([1.0, 0, 0]), fit), alternatives=fit.alternatives)
     best = Advisor(fit, 1).touches(1)[0]
     assert best.place_mm[0] < CENTRE[0] - 20  # towards the left end
     assert best.then_std_mm < 0.6 * best.std_mm
@@ -116,7 +116,7 @@ def test_advice_is_for_the_part_asked_for_and_for_touches_within_reach():
     assert {each.part for each in anywhere} == {"tumor_1"}
     assert {each.part for each in of_organ} == {"kidney"}
     kinds = [each.kind for each in anywhere]
-    assert kinds == ["touch", "touch", "touch", "outline", "look"]
+    assert kinds == ["touch", "touch", "touch", "outline", "view"]
     asked, first = [], anywhere[0]
 
     def reach(place_mm, normal):

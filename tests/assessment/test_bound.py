@@ -24,17 +24,17 @@ from tumortrack.assessment.bound import (
 from tumortrack.assessment.sight import Sight
 from tumortrack.assessment.verdict import finding_of
 from tumortrack.core.assessment import ErrorBound
-from tumortrack.core.types import DepthError, Look, SensorCloud
+from tumortrack.core.types import DepthError, SensorCloud, View
 from tumortrack.registration.frame import estimate_of
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from warp_objects import ANATOMY, placed
 
-FIT = {"now": 10.0, "without_strays": 10.0, "usual": 20.0, "strays": 0.0}
+FIT = {"now": 10.0, "without_outliers": 10.0, "usual": 20.0, "outliers": 0.0}
 
 
 def visible():
-    moved = placed(share=0.3).carry(ANATOMY.organ.vertices_mm)
+    moved = placed(share=0.3).forward(ANATOMY.organ.vertices_mm)
     normals = moved - moved.mean(0)
     return SensorCloud(moved[(normals * moved).sum(1) < 0].astype(np.float32))
 
@@ -61,7 +61,7 @@ def test_other_places_that_are_as_likely_are_within_the_bound(estimate):
     assert 0.05 < other.share < 0.6
     for chances, expected_mm in (((0.04,), 0.0), ((0.06,), 40.0), ((0.03, 0.03), 25.0)):
         others = [
-            {"more": 1.0, "apart_mm": {"kidney": 9.0, "tumor_1": mm}, "share": chance}
+            {"more": 1.0, "distance_mm": {"kidney": 9.0, "tumor_1": mm}, "share": chance}
             for chance, mm in zip(chances, (40.0, 25.0), strict=False)
         ]
         told = reporting(estimate, fit_cost={"others": others, **FIT}).report
@@ -122,7 +122,7 @@ def test_a_models_factor_multiplies_the_bounds_of_its_answers(model, estimate):
 def test_what_is_foreseen_of_a_touch_follows_those_before_it(one_place):
     found = one_place.assessed(bounds=bounds_of(one_place.report, 1.25), factor=1.25)
     *touches, outline, _ = every = advise(found, "tumor_1")
-    assert [each.kind for each in every] == ["touch", "touch", "touch", "outline", "look"]
+    assert [each.kind for each in every] == ["touch", "touch", "touch", "outline", "view"]
     now_mm = found.assessment.bounds["tumor_1"].error_bound95_mm
     assert touches[0].bound_mm == outline.bound_mm == pytest.approx(now_mm)
     for before, after in itertools.pairwise(touches):
@@ -147,9 +147,9 @@ def test_of_several_cameras_the_worst_counts_and_one_that_nobody_stated(model):
     shares = {}
     for first, second in ((0.0, 0.0), (0.0, 3.0), (3.0, 0.0), (0.0, None)):
         error = None if second is None else DepthError(second)
-        look = Look(replace(cloud, depth_error=error), cloud, np.eye(4))
+        view = View(replace(cloud, depth_error=error), cloud, np.eye(4))
         mine = replace(cloud, depth_error=DepthError(first))
-        found = tracker.locate(mine, views=[look], grid=16)
+        found = tracker.locate(mine, views=[view], grid=16)
         shares[first, second] = found.report.motion.depth_share
     assert shares[0.0, 0.0] == 0
     assert shares[0.0, 3.0] == pytest.approx(shares[3.0, 0.0])

@@ -15,9 +15,9 @@ from tumortrack.assessment.causes import explained, likely_causes, words
 from tumortrack.case.surface import surfaces
 from tumortrack.core.assessment import Assessment
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.geometry import HERE
+from tumortrack.core.geometry import IDENTITY
 from tumortrack.core.report import Cause, EvidenceReport, Likely
-from tumortrack.core.types import Anatomy, Look, PointNoise, SensorCloud
+from tumortrack.core.types import Anatomy, PointNoise, SensorCloud, View
 from tumortrack.io.run_folder import report_entry
 from tumortrack.simulation.deform import DragConfig
 from tumortrack.simulation.phantom.digital import PhantomParameters, phantom_labels
@@ -52,8 +52,8 @@ SPOILT = {
 
 
 @pytest.fixture(scope="module")
-def tracker(clinic_model):
-    return Tracker(load_model(clinic_model, "cpu"))
+def tracker(elastic_model):
+    return Tracker(load_model(elastic_model, "cpu"))
 
 
 def seen(tracker: Tracker, anatomy: Anatomy, number: int) -> np.ndarray:
@@ -151,12 +151,12 @@ def explained_causes(model, evidence=(), alone=False, in_sight=None, known=(FOUN
     estimate = small_estimate().reporting(evidence=evidence, in_sight=in_sight)
     points = SensorCloud(estimate.organ_mesh.vertices_mm)
     seen = SensorCloud(np.zeros((0, 3), np.float32)) if alone else points
-    causes, advice = explained(model, (Look(points, seen, HERE),), estimate, {"other": known})
+    causes, advice = explained(model, (View(points, seen, IDENTITY),), estimate, {"other": known})
     return [(one.cause, one.number) for one in causes], advice
 
 
-def piece(off_mm, left_out=True):
-    return EvidenceReport(name="touch", off_mm=off_mm, news=1.0, left_out=left_out)
+def piece(off_mm, rejected=True):
+    return EvidenceReport(name="touch", off_mm=off_mm, information_gain=1.0, rejected=rejected)
 
 
 HIDDEN, VIEW = (Cause.HIDDEN, 0.43), (Cause.VIEW, None)

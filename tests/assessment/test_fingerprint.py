@@ -37,5 +37,5 @@ def test_a_place_that_moved_or_a_figure_that_changed_is_another_method(monkeypat
     for by, stands in ((1.01, True), (1.03, False)):
         figures = {**each["figures"], figure: by * each["figures"][figure]}
         assert replay.stands({**known, name: {**each, "figures": figures}}, known) == stands
-    assert not replay.stands({**known, name: {"input_mm": {}, "verdict": "none: strays"}}, known)
+    assert not replay.stands({**known, name: {"input_mm": {}, "verdict": "none: outliers"}}, known)
     assert not replay.stands(dict(list(known.items())[1:]), known)

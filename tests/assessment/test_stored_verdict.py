@@ -27,7 +27,9 @@ def test_an_assessment_survives_writing_and_reading(tmp_path):
     said = Assessment(
         bounds={"tumor_1": ErrorBound(4.5, (0.0, 0.6, 0.8)), "tumor_2": ErrorBound(np.float64(2))},
         factor=1.25,
-        finding=Finding("miss", {"part": "t", "miss_mm": 4.5, "limit_mm": 4.0, "digits": "1"}),
+        finding=Finding(
+            "miss", {"part": "t", "error_bound95_mm": 4.5, "limit_mm": 4.0, "digits": "1"}
+        ),
         causes=(Likely(Cause.SCALE, 1.5, 0.25), Likely(Cause.VIEW)),
         advice=": look elsewhere",
         next_evidence=(
@@ -47,7 +49,7 @@ def test_an_assessment_survives_writing_and_reading(tmp_path):
         (None, {"verdict": "poor"}),
         (poor("it hides"), {"verdict": "good"}),
         (poor("it hides"), {"finding": None}),
-        (poor("it hides"), {"finding": {"kind": "rival", "values": {"part": "tumor_1"}}}),
+        (poor("it hides"), {"finding": {"kind": "alternative", "values": {"part": "tumor_1"}}}),
         (poor("it hides"), {"finding": {"kind": "fit", "values": {"times": "many"}}}),
         (poor("it hides"), {"finding": {"kind": "unheard_of", "values": {}}}),
     ],

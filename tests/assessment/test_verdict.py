@@ -20,19 +20,19 @@ from tumortrack.core.errors import NoEstimate
 from tumortrack.core.render import render_depth
 from tumortrack.core.report import EvidenceReport
 from tumortrack.core.types import DepthFrame, Mesh, PointNoise, SensorCloud
-from tumortrack.io.model_folder import weakness_of
+from tumortrack.io.model_folder import reliability_warning
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
 from warp_objects import ANATOMY, PLACE_MM, TURNED
 
 CAMERA = d405(424, 240)
-COST = {"now": 1.0, "without_strays": 1.0, "usual": 2.0, "strays": 0.0}
+COST = {"now": 1.0, "without_outliers": 1.0, "usual": 2.0, "outliers": 0.0}
 SURE = {"center_std_mm": 1.0, "probability": 0.9}
 
 
-def others(apart_mm):
-    return [{"more": 1.0, "apart_mm": {"kidney": 0.4, "tumor_1": apart_mm}}]
+def others(distance_mm):
+    return [{"more": 1.0, "distance_mm": {"kidney": 0.4, "tumor_1": distance_mm}}]
 
 
 @pytest.mark.parametrize(
@@ -43,9 +43,9 @@ def others(apart_mm):
         ({"size": {"times": 1.07, "gain": 9.1}}, None),
         ({"size": {"times": 1.07, "gain": 9.3}}, "size"),
         ({"fit_cost": COST | {"others": others(2.9)}}, None),
-        ({"fit_cost": COST | {"others": others(5.2)}}, "rival"),
+        ({"fit_cost": COST | {"others": others(5.2)}}, "alternative"),
         *(
-            ({"fit_cost": COST | {"beyond": {"less": 0.1, "tilt_degrees": tilt}}}, kind)
+            ({"fit_cost": COST | {"excluded_pose": {"less": 0.1, "tilt_degrees": tilt}}}, kind)
             for tilt, kind in ((40.0, "not_turned"), (80.0, "tilted"), (172.0, "upside_down"))
         ),
         ({"parts": {"kidney": SURE, "tumor_1": SURE | {"center_std_mm": 3.4}}}, "unsure"),
@@ -67,7 +67,7 @@ def test_a_bound_decides_and_what_is_over_the_limit_reads_as_over_it(part, over_
     finding = finding_of(report, {part: ErrorBound(POOR_MM + over_mm)}, Sight())
     assert (finding is not None) == (over_mm > 0)
     if finding is not None:
-        shown = [float(word.rstrip(".")) for word in finding.words.split() if word[0].isdigit()]
+        shown = [float(word.rstrip(".")) for word in finding.message.split() if word[0].isdigit()]
         assert finding.kind == "miss"
         assert shown[0] > shown[1]
 
@@ -75,11 +75,11 @@ def test_a_bound_decides_and_what_is_over_the_limit_reads_as_over_it(part, over_
 @pytest.mark.parametrize(
     ("cost", "rim", "strictly", "kind"),
     [
-        ({"without_strays": 3.9, "strays": 0.49}, 0.0, False, "fit"),
-        ({"without_strays": 3.9, "strays": 0.49}, 1.0, False, None),  # a wrong place would show
-        ({"without_strays": 3.9, "strays": 0.49}, 1.0, True, "fit"),
-        ({"without_strays": 4.1, "strays": 0.49}, 1.0, False, "fit"),
-        ({"without_strays": 3.9, "strays": 0.51}, 1.0, False, "strays"),
+        ({"without_outliers": 3.9, "outliers": 0.49}, 0.0, False, "fit"),
+        ({"without_outliers": 3.9, "outliers": 0.49}, 1.0, False, None),  # a wrong place would show
+        ({"without_outliers": 3.9, "outliers": 0.49}, 1.0, True, "fit"),
+        ({"without_outliers": 4.1, "outliers": 0.49}, 1.0, False, "fit"),
+        ({"without_outliers": 3.9, "outliers": 0.51}, 1.0, False, "outliers"),
     ],
 )
 def test_where_the_surroundings_are_seen_strays_are_no_part_of_the_fit(cost, rim, strictly, kind):
@@ -129,13 +129,15 @@ def test_an_organ_that_the_camera_sees_through_is_refused(sure):
     by_hand = looked(table.with_depth(hidden))
     hides = np.isfinite(alone.depth_mm[:, :200]).sum() / np.isfinite(alone.depth_mm).sum()
     assert 0.1 < hides < 0.9
-    assert seen_through(organ, by_hand[0].seen)[::2] == (0, pytest.approx(1 - hides, abs=0.02))
+    assert seen_through(organ, by_hand[0].full_view)[::2] == (0, pytest.approx(1 - hides, abs=0.02))
     assert judged(sure, by_hand).quality == "good"
     still = judged(sure, by_hand, last=before)  # what showed it a moment ago is hidden
     assert still.finding.kind == "hidden_now"
     assert judged(sure, by_hand, last=still).finding.kind == "hidden_now"
     assert judged(sure, looked(table), last=still).quality == "good"
-    aside = {name: mesh.moved(mesh.vertices_mm + 12.0) for name, mesh in sure.meshes.items()}
+    aside = {
+        name: mesh.with_vertices(mesh.vertices_mm + 12.0) for name, mesh in sure.meshes.items()
+    }
     assert judged(sure, by_hand, last=replace(before, meshes=aside)).quality == "good"
 
 
@@ -159,30 +161,30 @@ def test_a_cloud_tells_what_lies_behind_the_organ_and_what_it_does_not_show(sure
     assert judged(sure, looked(cloud(beyond))).finding.kind == "seen_through"
     hand = np.concatenate([half, points_mm[points_mm[:, 0] <= ends] * 0.8])  # hides, proves nothing
     assert cloud_shares(organ, cloud(hand))[1] < 0.06
-    close = organ.moved(organ.vertices_mm - [0, 0, organ.vertices_mm[:, 2].mean()])
+    close = organ.with_vertices(organ.vertices_mm - [0, 0, organ.vertices_mm[:, 2].mean()])
     assert cloud_shares(close, cloud(points_mm)) == (0.0, 1.0)  # round the camera
 
 
 def test_what_fits_worse_all_of_a_sudden_is_poor(tracker, stages):
-    """It may be another organ, put there; from a first look on, the same fit may be good."""
+    """It may be another organ, put there; from a first view on, the same fit may be good."""
     points, rng = stages[0].cloud.points_mm, np.random.default_rng(8)
     clean = tracker.follow(stages[0].cloud)
     alone = image(clean.meshes["kidney"])
     table = alone.with_depth(np.fmin(alone.depth_mm, np.float32(np.nanmax(alone.depth_mm) + 30)))
     low, high = points.min(0), points.max(0)
     anywhere = low + (high - low) * rng.uniform(-0.1, 1.1, points.shape)
-    strays = np.where(rng.random((len(points), 1)) < 0.35, anywhere, points)
-    first = tracker.follow(SensorCloud(strays), seen=table)
+    outliers = np.where(rng.random((len(points), 1)) < 0.35, anywhere, points)
+    first = tracker.follow(SensorCloud(outliers), full_view=table)
     cost = first.report.fit_cost
     assert cost.now > cost.usual
-    kept = tracker.follow(SensorCloud(strays, noise=PointNoise())).report.fit_cost
-    assert 0.15 < kept.strays < 0.35  # measured already: nothing is cleaned away
-    assert kept.without_strays < 0.3 * kept.now  # what lies within 2 mm still counts
+    kept = tracker.follow(SensorCloud(outliers, noise=PointNoise())).report.fit_cost
+    assert 0.15 < kept.outliers < 0.35  # measured already: nothing is cleaned away
+    assert kept.without_outliers < 0.3 * kept.now  # what lies within 2 mm still counts
     first, clean = (one.assessed(finding=None) for one in (first, clean))
     # The ellipsoid's half turn, and its bound, are another matter.
-    sudden = tracker.follow(SensorCloud(strays), clean, seen=table)
-    later = tracker.follow(SensorCloud(strays), sudden, seen=table)
-    usual = tracker.follow(SensorCloud(strays), first, seen=table)
+    sudden = tracker.follow(SensorCloud(outliers), clean, full_view=table)
+    later = tracker.follow(SensorCloud(outliers), sudden, full_view=table)
+    usual = tracker.follow(SensorCloud(outliers), first, full_view=table)
     kinds = [one.finding and one.finding.kind for one in (sudden, later, usual)]
     assert kinds[:2] == ["fit", "fit"]
     assert kinds[2] != "fit"
@@ -198,14 +200,16 @@ def test_following_goes_on_to_say_that_another_place_fits_as_well(tracker, known
         return ElasticMotion(shape, TURNED @ turn, place_mm, shape.body.mean)
 
     def cloud(frame: int) -> SensorCloud:
-        organ = ANATOMY.organ.moved(lies(frame, np.eye(3)).carry(ANATOMY.organ.vertices_mm))
+        organ = ANATOMY.organ.with_vertices(
+            lies(frame, np.eye(3)).forward(ANATOMY.organ.vertices_mm)
+        )
         points_mm = deproject(image(organ))[::5]
         return SensorCloud(points_mm.astype(np.float32), (frame + 1) * 33_000_000)
 
     follower = Follower(tracker, FollowerConfig(rescan_s=100.0))
     first = follower.locate(cloud(0))
-    rivals = ((lies(0, half_turn), 0.5),) if known else ()
-    start = replace(lies(0, np.eye(3)), rivals=rivals)  # whatever the first look found
+    alternatives = ((lies(0, half_turn), 0.5),) if known else ()
+    start = replace(lies(0, np.eye(3)), alternatives=alternatives)  # whatever the first view found
     follower.begin(replace(first, unsmoothed=start))
     for frame in (1, 2, 3):
         found = follower.locate(cloud(frame))
@@ -213,7 +217,7 @@ def test_following_goes_on_to_say_that_another_place_fits_as_well(tracker, known
         assert len(others) == known
         if known:
             assert found.quality == "poor"
-            assert others[0].apart_mm["tumor_1"] == pytest.approx(40.0, abs=1.5)
+            assert others[0].distance_mm["tumor_1"] == pytest.approx(40.0, abs=1.5)
 
 
 def test_an_organ_that_looks_the_same_after_half_a_turn_is_in_doubt(slim_model, stages):
@@ -223,7 +227,7 @@ def test_an_organ_that_looks_the_same_after_half_a_turn_is_in_doubt(slim_model, 
     for stage in stages[:4]:
         estimate = Tracker(trained).follow(stage.cloud)
         assert estimate.quality == "poor"
-        away_mm = max(one.apart_mm["tumor_1"] for one in estimate.report.fit_cost.others)
+        away_mm = max(one.distance_mm["tumor_1"] for one in estimate.report.fit_cost.others)
         assert away_mm > 10  # of 16, 40 and 43 mm that the half-turns move it
 
 
@@ -235,14 +239,16 @@ FAR_MM = SURFACE_MM[SURFACE_MM[:, 2].argmax()]
 
 
 def told(place_mm, name="touch", **more):
-    return EvidenceReport(name=name, off_mm=22.0, news=0.0, places_mm=(tuple(place_mm),), **more)
+    return EvidenceReport(
+        name=name, off_mm=22.0, information_gain=0.0, places_mm=(tuple(place_mm),), **more
+    )
 
 
-FALSE = told(FOOT_MM + [0, 0, 22.0], left_out=True)
-THERE = told(FOOT_MM + [3.0, 0, 0], left_out=False)
-ELSEWHERE = told(FAR_MM, left_out=False)
-OLD = [told(FAR_MM, left_out=out, before=True) for out in (True, True, False)]
-MOMENTARY = [told(FAR_MM, name, left_out=True) for name in ("held", "free")]
+FALSE = told(FOOT_MM + [0, 0, 22.0], rejected=True)
+THERE = told(FOOT_MM + [3.0, 0, 0], rejected=False)
+ELSEWHERE = told(FAR_MM, rejected=False)
+OLD = [told(FAR_MM, rejected=out, before=True) for out in (True, True, False)]
+MOMENTARY = [told(FAR_MM, name, rejected=True) for name in ("grasp", "free_space")]
 
 
 @pytest.mark.parametrize(
@@ -279,20 +285,20 @@ def test_a_model_that_was_mostly_wrong_says_so_in_every_estimate(slim_model, sta
     found = Tracker(bad).follow(stages[0].cloud)
     assert (found.quality, found.finding.kind) == ("poor", "model")
     assert found.assessment.shown == {}
-    assert weakness_of({"validation_far": 0.1}) == weakness_of({}) == ""
-    assert weakness_of({"half_turn_mm": 0.4})
+    assert reliability_warning({"validation_far": 0.1}) == reliability_warning({}) == ""
+    assert reliability_warning({"half_turn_mm": 0.4})
 
 
-def test_locate_says_its_verdict_and_plan_heeds_it(tmp_path, phantom_case, clinic_model):
+def test_locate_says_its_verdict_and_plan_heeds_it(tmp_path, phantom_case, elastic_model):
     succeeded(tumortrack("simulate", phantom_case, tmp_path / "scenes", "--scenes", 1))
     run, cloud = tmp_path / "run", tmp_path / "scenes" / "0000" / "cloud.ply"
-    done = tumortrack("locate", clinic_model, cloud, "--out", run, "--device", "cpu")
+    done = tumortrack("locate", elastic_model, cloud, "--out", run, "--device", "cpu")
     said, quality = answered(done), store.read_json(run / "report.json")["quality"]
     assert done.returncode == {"good": 0, "poor": 4}[quality["verdict"]]
     assert said.startswith(f"{quality['verdict']}: ")
     assert f"<h1>{quality['verdict'].upper()}</h1>" in (run / "index.html").read_text()
     manifest = store.read_json(run / store.MANIFEST)
-    hides = {"kind": "model", "values": {"words": "the organ hides"}}
+    hides = {"kind": "model", "values": {"message": "the organ hides"}}
     for verdict, finding in (("good", None), ("poor", hides)):
         report = store.read_json(run / "report.json")
         report["assessment"] |= {"finding": finding, "advice": ""}

@@ -64,7 +64,7 @@ def test_open_meshes_are_taken_as_they_are(label_map, tmp_path):
     sheet_read = prepare(label_map, options).anatomy.structures["cut"]
     assert len(sheet_read.faces) == 2
     assert sheet_read.box_mm == pytest.approx(sheet.box_mm)
-    write_mesh(tmp_path / "far.ply", sheet.moved(sheet.vertices_mm + 500))
+    write_mesh(tmp_path / "far.ply", sheet.with_vertices(sheet.vertices_mm + 500))
     with refused(InputError, "cut", "--unit m"):
         prepare(label_map, replace(options, structure=(f"cut={tmp_path / 'far.ply'}",)))
 

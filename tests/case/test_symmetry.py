@@ -12,7 +12,7 @@ from tumortrack.cli.main import run
 from tumortrack.core import store
 from tumortrack.core.types import Anatomy
 from tumortrack.io.mesh_files import write_anatomy
-from tumortrack_lab.world.kidneys import random_anatomy
+from tumortrack_benchmarks.physics.kidneys import random_anatomy
 
 # Of the ellipsoid's tumor, 8 mm and 20 mm from the middle along two of its axes: half a turn about
 # the third moves it by twice its distance, about one of them by twice the other's.
@@ -35,7 +35,7 @@ def test_an_ellipsoid_looks_the_same_after_each_half_turn():
 def test_figures_do_not_depend_on_where_the_organ_lies():
     anatomy = bent(organ(), 0.5)
     turn, shift = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix(), [30.0, -70.0, 400.0]
-    moved = tuple(part.moved(part.vertices_mm @ turn.T + shift) for part in anatomy.parts)
+    moved = tuple(part.with_vertices(part.vertices_mm @ turn.T + shift) for part in anatomy.parts)
     here, there = half_turns(anatomy), half_turns(Anatomy(moved))
     for first, second in zip(here, there, strict=True):
         assert second.mean_mm == pytest.approx(first.mean_mm, abs=0.02)

@@ -15,7 +15,7 @@ from tumortrack.cli.main import run
 from tumortrack.core import store
 from tumortrack.core.errors import StorageError
 from tumortrack.io.case import load_case
-from tumortrack.io.model_folder import read_model_manifest, weakness_of
+from tumortrack.io.model_folder import read_model_manifest, reliability_warning
 from tumortrack.io.nifti import write_nifti
 from tumortrack.io.ply import write_cloud_ply
 from tumortrack.report.inspection import describe
@@ -102,11 +102,11 @@ def test_a_case_that_cannot_be_written_to_says_so_at_once(case, monkeypatch, cap
 
 @pytest.mark.slow
 def test_another_cases_model_is_replaced_and_a_strangers_file_is_not(
-    models_at_once, case, clinic_model
+    models_at_once, case, elastic_model
 ):
     """As after a copy of one case's folder over another's."""
     kept = case / "model"
-    shutil.copytree(clinic_model, kept)
+    shutil.copytree(elastic_model, kept)
     manifest = store.read_json(kept / store.MANIFEST)
     manifest["provenance"]["case_sha256"] = "another"
     store.write_json(kept / store.MANIFEST, manifest)
@@ -180,7 +180,7 @@ def test_prepare_says_that_a_ball_does_not_show_how_it_lies(tmp_path):
     said = tumortrack(
         "prepare", tmp_path / "ball.nii.gz", "--out", tmp_path / "case", "--rotations", "full"
     )
-    weakness = weakness_of(read_model_manifest(tmp_path / "case" / "model")["provenance"])
+    weakness = reliability_warning(read_model_manifest(tmp_path / "case" / "model")["provenance"])
     assert weakness
     assert weakness in succeeded(said)
     assert weakness in "\n".join(describe(tmp_path / "case"))

@@ -40,8 +40,8 @@ def test_the_demo_tells_the_whole_story(demo):
     for name, entry in zip(names, report["scenes"], strict=True):
         scene = read_scene(out / "dataset" / name)
         # True surfaces have the case's triangles, on any machine.
-        assert entry["rivals"]["best_rigid_pose"]["by"] == "triangles"
-        assert entry["words"] == scene.meta["words"] == shown[name].meta["words"]
+        assert entry["baselines"]["best_rigid_pose"]["by"] == "triangles"
+        assert entry["message"] == scene.meta["words"] == shown[name].meta["words"]
         assert len(scene.reference.tumors) == 2
         assert (out / "scenes" / f"{name}.png").stat().st_size > 10_000
     assert (out / "index.html").stat().st_size > 100_000  # self-contained, with its viewer

@@ -61,9 +61,9 @@ def test_touches_bring_a_hidden_half_nearer(story):
     assert len(off) == 6  # two tumors: without, with three, with six
     assert 0 < sum(off[4:]) < sum(off[:2])
     gains = re.findall(r"next, .+: tumor_\d .+ ([\d.]+) mm instead of ([\d.]+)", said["08"])
-    assert len(gains) >= 8  # twice three touches, an outline, a look
+    assert len(gains) >= 8  # twice three touches, an outline, a view
     assert all(float(then) <= float(now) for then, now in gains)
-    assert said["08"].count("of it news") == 6
+    assert said["08"].count("of it information_gain") == 6
 
 
 def test_the_scene_is_deformed_and_pictured(story):

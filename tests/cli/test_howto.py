@@ -51,10 +51,10 @@ def write_touches(path: Path, case: Case) -> None:
 
 
 @pytest.fixture
-def desk(tmp_path, phantom_case, clinic_model):
+def desk(tmp_path, phantom_case, elastic_model):
     """A reader's folder: a label map, a case and its model, a cloud, points of the CT."""
     shutil.copy(phantom_case / "labels.nii.gz", tmp_path)
-    shutil.copytree(clinic_model, tmp_path / "MODEL")
+    shutil.copytree(elastic_model, tmp_path / "MODEL")
     case = load_case(phantom_case)
     cloud = cloud_by_rays(case, looking_down(case)).astype(np.float32)
     write_cloud_ply(tmp_path / "cloud.ply", cloud)

@@ -55,23 +55,23 @@ def raw(tmp_path, phantom_case):
 
 
 @pytest.mark.parametrize("size", [(1024, 768), (1366, 768), (401, 301)])
-def test_a_depth_image_of_any_size_has_its_page(size, clinic_model, phantom_case, tmp_path):
+def test_a_depth_image_of_any_size_has_its_page(size, elastic_model, phantom_case, tmp_path):
     organ = load_case(phantom_case).anatomy.organ
     camera = Intrinsics(*size, 0.7 * size[0], 0.7 * size[0], size[0] / 2, size[1] / 2)
     frame = make_scene(organ, HAND, np.random.default_rng(3), camera).frame
     write_frame_folder(tmp_path / "scene", frame)
     paths = {"intrinsics": (tmp_path / "scene" / "intrinsics.json",)}
-    tt.locate_files(clinic_model, tmp_path / "scene" / "depth.png", grid=32, **paths).save(
+    tt.locate_files(elastic_model, tmp_path / "scene" / "depth.png", grid=32, **paths).save(
         str(tmp_path / "run")
     )
     assert (tmp_path / "run" / PAGE).is_file()
 
 
-def test_the_organ_is_found_in_a_raw_depth_image(raw, clinic_model, phantom_case):
+def test_the_organ_is_found_in_a_raw_depth_image(raw, elastic_model, phantom_case):
     def locate(image, *options):
         command = (
             "locate",
-            clinic_model,
+            elastic_model,
             raw / image,
             "--out",
             raw / "run",
@@ -117,8 +117,8 @@ def test_the_organ_is_found_in_a_raw_depth_image(raw, clinic_model, phantom_case
     assert again.volume.labels.max() == 3
 
 
-def test_without_an_estimate_there_is_a_page_that_says_why(raw, clinic_model):
-    command = ("locate", clinic_model, raw / "depth.png", "--out", raw / "run", "--grid", 32)
+def test_without_an_estimate_there_is_a_page_that_says_why(raw, elastic_model):
+    command = ("locate", elastic_model, raw / "depth.png", "--out", raw / "run", "--grid", 32)
     command = (*command, "--intrinsics", raw / "camera.json")
     line = refusal(done := tumortrack(*command, "--at", 5, 5))
     assert done.returncode == 3
@@ -139,7 +139,7 @@ def test_without_an_estimate_there_is_a_page_that_says_why(raw, clinic_model):
     assert "424" in refusal(tumortrack(*command, "--overwrite", "--at", 424, 0))
 
 
-def test_the_verdict_is_said_before_anything_is_written(raw, clinic_model):
+def test_the_verdict_is_said_before_anything_is_written(raw, elastic_model):
     out, said = raw / "run", []
 
     class Watched(io.StringIO):
@@ -149,7 +149,7 @@ def test_the_verdict_is_said_before_anything_is_written(raw, clinic_model):
 
     command = (
         "locate",
-        clinic_model,
+        elastic_model,
         raw / "depth.png",
         "--out",
         out,
@@ -215,11 +215,17 @@ def test_the_page_shows_evidence_and_what_to_learn_next_where_the_organ_surely_l
 ):
     place_mm = [4.0, -3.0, 104.0]
     foreseen = [  # each touch after those before it
-        ("touch", 5.26, 3.12), ("touch", 3.12, 2.5), ("touch", 2.5, 2.2), ("look", 5.26, 4.01)
+        ("touch", 5.26, 3.12), ("touch", 3.12, 2.5), ("touch", 2.5, 2.2), ("view", 5.26, 4.01)
     ]  # fmt: skip
     known = [
-        {"name": "touch", "tool": "probe", "off_mm": 0.44, "news": 0.312, "left_out": False},
-        {"name": "outline", "off_mm": 24.0, "news": 0.0, "left_out": True},
+        {
+            "name": "touch",
+            "tool": "probe",
+            "off_mm": 0.44,
+            "information_gain": 0.312,
+            "left_out": False,
+        },
+        {"name": "outline", "off_mm": 24.0, "information_gain": 0.0, "left_out": True},
     ]
     known = [{**each, "places_mm": [[30.0, 20.0, 110.0 + n]]} for n, each in enumerate(known)]
     advice = [
@@ -231,8 +237,8 @@ def test_the_page_shows_evidence_and_what_to_learn_next_where_the_organ_surely_l
         for kind, bound_mm, then_mm in foreseen
     ]  # fmt: skip
     estimate = advised(reporting(small_estimate(), evidence=known), advice)
-    rival = Finding("rival", {"part": "tumor_1", "apart_mm": 9.0})
-    estimate = estimate.assessed(finding=None if placed else rival)
+    baseline = Finding("baseline", {"part": "tumor_1", "distance_mm": 9.0})
+    estimate = estimate.assessed(finding=None if placed else baseline)
     write_run_page(tmp_path, {}, estimate, Seen())
     page = (tmp_path / PAGE).read_text()
     for cell in (">touch 1</th>", ">0.4 mm</td>", ">31 %</td>", ">outline 2</th>", ">24.0 mm</td>"):

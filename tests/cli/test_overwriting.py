@@ -20,13 +20,13 @@ PACKAGES = (
     "devices/src/tumortrack_devices",
     "occupancy/src/tumortrack_occupancy",
     "resection/src/tumortrack_resection",
-    "lab/src/tumortrack_lab",
+    "benchmarks/src/tumortrack_benchmarks",
     "experiment/src/tumortrack_experiment",
 )
 OPTION = re.compile(r"--[a-z][a-z-]+")
 # Options of other programs that messages name.
 OTHERS = {"--device-cgroup-rule", "--user", "--upgrade"}
-OF_SCRIPTS = {"scripting.py"}  # of lab/scripts
+OF_SCRIPTS = {"scripting.py"}  # of benchmarks/scripts
 MINE = "of the user's own"
 # Every command that writes, with what it needs before it looks at where it is to write.
 COMMANDS = {
@@ -95,12 +95,19 @@ def test_options_that_messages_name_are_options_of_some_command(capsys, monkeypa
 
 
 @pytest.mark.slow
-def test_a_start_of_track_that_failed_leaves_nothing(clinic_model, tmp_path):
+def test_a_start_of_track_that_failed_leaves_nothing(elastic_model, tmp_path):
     """Its names are free for the corrected command."""
     empty = tmp_path / "empty"
     empty.mkdir()
     report, seen = tmp_path / "track.json", tmp_path / "seen"
-    command = ["track", clinic_model, f"recording:{empty}", f"recording:{seen}", "--report", report]
+    command = [
+        "track",
+        elastic_model,
+        f"recording:{empty}",
+        f"recording:{seen}",
+        "--report",
+        report,
+    ]
     assert str(empty) in refusal(tumortrack(*command, "--device", "cpu"))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["empty"]
     report.write_text(MINE)

@@ -67,8 +67,8 @@ def test_commands_and_an_example_run_from_the_wheel(environment, tmp_path):
     for name, package in (
         ("onnx", "tumortrack-occupancy"),
         ("plan", "tumortrack-resection"),
-        ("twin", "tumortrack-lab"),
-        ("margins", "tumortrack-lab"),
+        ("twin", "tumortrack-benchmarks"),
+        ("margins", "tumortrack-benchmarks"),
         ("record", "tumortrack-experiment"),
     ):
         without = subprocess.run([*command, name], capture_output=True, text=True, env=clean)

@@ -30,11 +30,11 @@ SIGNATURES = {
     "progress=None",
     "export": "case folder options",
     "find_organ": "content model=None range_mm=None box_mm=None mask=None picked_mm=None "
-    "picture=None taught=None seed=0",
+    "picture=None tissue_classifier=None seed=0",
     "load_case": "folder",
     "load_estimate": "folder",
     "load_model": "folder device='auto'",
-    "locate": "case points views=() evidence=() seen=None grid=160 seed=0 frame='camera' "
+    "locate": "case points views=() evidence=() full_view=None grid=160 seed=0 frame='camera' "
     "device='auto'",
     "locate_files": "model clouds options",
     "prepare": "source folder=None overwrite=False segment=None progress=None options",
@@ -42,16 +42,25 @@ SIGNATURES = {
     "read_depth": "path intrinsics unit_mm=None",
     "scan_phantom": "folder seed=1 spacing_mm=(1.2, 1.2, 1.5)",
     "simulate_scenes": "case count=1 seed=0 elastic=True noise=True",
-    "teach": "frame picture organ beside",
+    "train_tissue_classifier": "frame picture organ beside",
     "track": "tracker source sinks=() until=None seconds=0.0 range_mm=None options",
-    "train": "case folder preset='clinic' config=None rotations=None sensor=None minutes=None "
+    "train": "case folder preset='elastic' config=None rotations=None sensor=None minutes=None "
     "steps=None seed=0 device='auto' workers=None checkpoint_every_s=30.0 report=None "
     "progress=None",
     "write_scenes": "case folder progress=None options",
 }
 OTHERS = {
-    *("Case", "DepthFrame", "Estimate", "Evaluation", "Free", "Held", "Intrinsics", "Landmark"),
-    *("Look", "Outline", "SensorCloud", "Touch", "TrackSummary", "Tracker"),
+    *(
+        "Case",
+        "DepthFrame",
+        "Estimate",
+        "Evaluation",
+        "FreeSpace",
+        "Grasp",
+        "Intrinsics",
+        "Landmark",
+    ),
+    *("View", "Outline", "SensorCloud", "Touch", "TrackSummary", "Tracker"),
     *("datasets", "errors", "presets"),
 }
 
@@ -72,7 +81,7 @@ def test_unknown_names_and_options_are_refused(tmp_path, unchecked):
         tt.prepair  # noqa: B018
     with refused(tt.errors.InputError, "kidney", "organ_hu"):
         tt.prepare(tmp_path, kidney=(1, 2))
-    with refused(tt.errors.InputError, "fast", "clinic"):
+    with refused(tt.errors.InputError, "fast", "elastic"):
         tt.train(tmp_path, tmp_path, preset="fast")
 
 
@@ -104,7 +113,7 @@ UNMADE = object.__new__(tt.Tracker)  # it looks at what it is given before the m
         (lambda: tt.locate("ABSENT", CLOUD), "ABSENT"),
         (lambda: tt.locate(None, CLOUD), ""),
         (lambda: UNMADE.locate(CLOUD, views=[tt.Touch(place_mm=(0, 0, 100))]), "evidence="),
-        (lambda: UNMADE.locate(CLOUD, evidence=[tt.Look(CLOUD, CLOUD, np.eye(4))]), "views="),
+        (lambda: UNMADE.locate(CLOUD, evidence=[tt.View(CLOUD, CLOUD, np.eye(4))]), "views="),
         (lambda: tt.evaluate(print, []), ""),
         (lambda: tt.evaluate(7, [1]), ""),
         (lambda: tt.find_organ(CLOUD, model="CASE"), ""),

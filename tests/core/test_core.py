@@ -100,7 +100,7 @@ def test_volume_of_a_box_wherever_it_lies_and_however_it_turns():
     turn = rotation_onto(np.array([1.0, 0, 0]), np.array([1.0, 2, 3]))
     mesh = box((2, 3, 4), (1000, -2000, 500))
     assert mesh.volume_mm3 == pytest.approx(24)
-    assert mesh.moved(mesh.vertices_mm @ turn.T).volume_mm3 == pytest.approx(24)
+    assert mesh.with_vertices(mesh.vertices_mm @ turn.T).volume_mm3 == pytest.approx(24)
     assert Mesh(mesh.vertices_mm, mesh.faces[:, ::-1]).volume_mm3 == pytest.approx(-24)
     np.testing.assert_allclose(mesh.box_mm, [[999, -2001.5, 498], [1001, -1998.5, 502]])
 

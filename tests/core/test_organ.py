@@ -64,7 +64,7 @@ def test_a_livers_files_bear_its_name(tmp_path):
     assert {"liver.ply", "tumor_1.ply"} <= {path.name for path in tmp_path.iterdir()}
     again = load_case(tmp_path).anatomy
     assert again.names == ("liver", "tumor_1")
-    assert again.of(again.tumors).kind == LIVER.__replace__(term=LIVER.snomed)
+    assert again.with_parts(again.tumors).organ_kind == LIVER.__replace__(term=LIVER.snomed)
 
 
 def test_a_case_that_names_no_organ_or_a_strange_one_is_refused(tmp_path):
@@ -85,7 +85,7 @@ def test_the_largest_piece_is_taken_of_what_has_no_sides():
     labels = prostate(voxel_mm=2.0).labels
     two = np.concatenate([labels, labels[:, :, : labels.shape[2] // 2 + 3]], axis=2)
     volume = LabelVolume(np.pad(two, 4), np.diag([2.0, 2, 2, 1]))
-    found, notes, side = select_labels(volume, kind=Organ(name="prostate"))
+    found, notes, side = select_labels(volume, organ_kind=Organ(name="prostate"))
     assert found.labels.sum() == pytest.approx(labels.sum(), rel=0.01)
     assert side == "unknown"
     assert any("2 large pieces" in note for note in notes)
@@ -94,7 +94,7 @@ def test_the_largest_piece_is_taken_of_what_has_no_sides():
 def test_thirty_tumors_and_none(tmp_path):
     places = [(x, y, z) for x in (-60, -40, -20, 0, 20) for y in (-18, 0, 18) for z in (-9, 9)]
     labels = liver(tuple((place, 7.0) for place in places), voxel_mm=3.0)
-    found, _, _ = select_labels(labels, kind=LIVER)
+    found, _, _ = select_labels(labels, organ_kind=LIVER)
     anatomy, _ = surfaces(found, LIVER)
     assert len(anatomy.tumors) == 30
     write_anatomy(tmp_path, Anatomy(anatomy.parts[:1], LIVER))
@@ -106,7 +106,7 @@ def test_thirty_tumors_and_none(tmp_path):
 def test_only_larger_organs_than_kidneys_are_seen_from_farther():
     config = SceneConfig()
     wide = surfaces(liver(voxel_mm=5.0), LIVER)[0]
-    assert config.seen_whole(wide.of(wide.parts)).pose.nearest_mm[0] > 200
+    assert config.seen_whole(wide.with_parts(wide.parts)).pose.nearest_mm[0] > 200
     assert config.seen_whole(Anatomy(wide.parts)) is config  # a kidney's scenes never change
     small = surfaces(prostate(voxel_mm=2.0), Organ(name="prostate"))[0]
     assert config.seen_whole(small) is config

@@ -92,15 +92,17 @@ def test_a_box_keeps_what_lies_in_it():
     z = image.depth_mm
     places = [(u - CAMERA.cx) / CAMERA.fx * z, (v - CAMERA.cy) / CAMERA.fy * z, z]
     inside = np.all([(a < p) & (p < b) for a, b, p in zip(low, high, places, strict=True)], axis=0)
-    numbers = np.where(image.taken == 0, 1 + (u > 12), 0).astype(np.int32)
+    numbers = np.where(image.pixel_class == 0, 1 + (u > 12), 0).astype(np.int32)
     area = choose.area_inside(image, numbers, low, high, 3)
     for number in (1, 2):
         expected = (z[inside & (numbers == number)] ** 2).sum() / (CAMERA.fx * CAMERA.fy)
         assert area[number] == pytest.approx(expected, rel=1e-6)
-    before = image.taken.copy()
+    before = image.pixel_class.copy()
     working_image.keep_inside(image, np.array([high, low]), RANGE)
-    np.testing.assert_array_equal(image.taken, np.where((before == 0) & ~inside, RANGE, before))
-    assert 50 < (image.taken == 0).sum() < (before == 0).sum()
+    np.testing.assert_array_equal(
+        image.pixel_class, np.where((before == 0) & ~inside, RANGE, before)
+    )
+    assert 50 < (image.pixel_class == 0).sum() < (before == 0).sum()
 
 
 def test_a_cloud_is_seen_from_its_origin():
@@ -124,7 +126,7 @@ def test_a_cloud_is_seen_from_its_origin():
     np.minimum.at(nearest, pixel[pixel >= 0], points[pixel >= 0, 2])
     np.testing.assert_array_equal(depth_mm.ravel(), np.where(nearest < np.inf, nearest, np.nan))
     nothing = working_image.image_of_cloud(SensorCloud(-np.abs(points)))
-    assert not len(nothing.remaining(nothing.taken))
+    assert not len(nothing.remaining(nothing.pixel_class))
 
 
 def test_the_best_plane_has_the_best_score():
@@ -154,16 +156,16 @@ def test_the_best_plane_has_the_best_score():
 
 def test_pixels_with_few_neighbours_are_isolated():
     image = rough(3)
-    z, taken = np.pad(image.depth_mm, 1), np.pad(image.taken, 1)
-    outside = np.pad(np.zeros(image.taken.shape, bool), 1, constant_values=True)
-    near = np.zeros(image.taken.shape, int)
+    z, taken = np.pad(image.depth_mm, 1), np.pad(image.pixel_class, 1)
+    outside = np.pad(np.zeros(image.pixel_class.shape, bool), 1, constant_values=True)
+    near = np.zeros(image.pixel_class.shape, int)
     for shift in ((y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if (y, x) != (0, 0)):
         there = [np.roll(values, shift, (0, 1))[1:-1, 1:-1] for values in (z, taken, outside)]
         apart = np.abs(there[0] - image.depth_mm)
         near += there[2] | ((there[1] == 0) & (apart < tolerance(image.depth_mm)))
     out = np.empty(near.shape, bool)
-    pieces.find_isolated(image.depth_mm, image.taken, JUMP, out)
-    np.testing.assert_array_equal(out, (image.taken == 0) & (near < 3))
+    pieces.find_isolated(image.depth_mm, image.pixel_class, JUMP, out)
+    np.testing.assert_array_equal(out, (image.pixel_class == 0) & (near < 3))
     assert 20 < out.sum() < 400
 
 
@@ -218,13 +220,15 @@ def test_a_piece_is_measured():
     numbers, distance = np.zeros((20, 30), np.int32), np.ones((20, 30), np.float32)
     numbers[5:9, 10:16], numbers[12:, 3] = 1, 2
     distance[6, 12] = 2.5
-    image.taken[4, 10:13] = LAST_BOX
+    image.pixel_class[4, 10:13] = LAST_BOX
     sizes = choose.measure(image, distance, numbers, 3)
     np.testing.assert_allclose(sizes.area_mm2, [0, 24e4 / 2600, 8e4 / 2600, 0])
     np.testing.assert_allclose(sizes.thick_mm, [0, 10, 4, 0])  # at 100 mm a pixel is 2 mm wide
     assert sizes.wide_mm[1] == pytest.approx(0.7071 * (5 * 2 + 3 * 100 / 52))
     assert sizes.wide_mm[2] == pytest.approx(700 / 52)
-    np.testing.assert_allclose(sizes.cut[1:3], [6 / np.sqrt(24e4 / 2600), 2 / np.sqrt(8e4 / 2600)])
+    np.testing.assert_allclose(
+        sizes.border_fraction[1:3], [6 / np.sqrt(24e4 / 2600), 2 / np.sqrt(8e4 / 2600)]
+    )
     aside = np.hypot((12.5 - 14.3) / 50, (6.5 - 9.8) / 52)
     assert sizes.aside[1] == pytest.approx(aside)
-    assert sizes.aside[3] == sizes.wide_mm[3] == sizes.cut[3] == 0
+    assert sizes.aside[3] == sizes.wide_mm[3] == sizes.border_fraction[3] == 0

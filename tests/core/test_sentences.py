@@ -41,9 +41,9 @@ def test_every_kind_has_one_sentence():
 def test_a_sentence_says_each_of_its_values(kind, sentence):
     values = values_of(sentence)
     said = Finding(kind, values)
-    assert not {"{", "}"} & set(said.words)
+    assert not {"{", "}"} & set(said.message)
     for value in values.values():
-        assert value == "2" or str(value).removesuffix(".0") in said.words
+        assert value == "2" or str(value).removesuffix(".0") in said.message
     assert "7" not in said.words_without_numbers
     other = {name: 3.0 if value == 7.0 else value for name, value in values.items()}
     assert said.same_as == Finding(kind, other).same_as

@@ -16,7 +16,7 @@ import tumortrack as tt
 
 points = np.zeros((300, 3))
 cloud = tt.SensorCloud(points)
-view, touch = tt.Look(cloud, cloud, np.eye(4)), tt.Touch(place_mm=(0.0, 0.0, 100.0))
+view, touch = tt.View(cloud, cloud, np.eye(4)), tt.Touch(place_mm=(0.0, 0.0, 100.0))
 case = tt.load_case("CASE")
 tracker = tt.Tracker(case)
 estimate = tracker.locate(points)
@@ -27,7 +27,7 @@ ESTIMATE = "tumortrack.core.estimate.Estimate"
 ARRAY = re.compile(r"numpy\.ndarray\[.*\]")
 TYPES = {
     'tt.locate("CASE", points)': ESTIMATE,
-    "tt.locate(case, cloud, views=[view], evidence=[touch], seen=cloud, grid=8, seed=1)": ESTIMATE,
+    "tt.locate(case, cloud, views=[view], evidence=[touch], full_view=cloud, grid=8)": ESTIMATE,
     'tracker.locate(points, views=[view], evidence=(touch,), frame="camera")': ESTIMATE,
     'tt.locate_files("CASE", ["a.png"], intrinsics="c.json").estimate': f"{ESTIMATE} | None",
     'estimate.tumors["tumor_1"].center_mm': ARRAY,

@@ -30,7 +30,7 @@ from tumortrack.case.meshes import read_meshes
 from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import TumortrackError
-from tumortrack.core.evidence import Free, Outline, Touch
+from tumortrack.core.evidence import FreeSpace, Outline, Touch
 from tumortrack.core.types import Volume
 from tumortrack.io.evidence_files import evidence_json
 
@@ -370,7 +370,7 @@ def test_recordings(kind, tmp_path, times):
 
     folder = tmp_path
     if kind == "ours":
-        free = Free(places_mm=((0.0, 0.0, 90.0),))
+        free = FreeSpace(places_mm=((0.0, 0.0, 90.0),))
         updates = [replace(update_number(n), evidence=(free,)) for n in range(2)]
         file = record(folder / "ours", updates) / "ours.mcap"
     else:

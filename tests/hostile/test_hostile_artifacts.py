@@ -220,7 +220,7 @@ def nearer_tumor(folder: Path) -> None:
     planned = json.loads((folder / "plan.json").read_text())["plan"]
     path = folder / f"{planned['tumor']}.ply"
     mesh = read_mesh(path)
-    write_mesh(path, mesh.moved(mesh.vertices_mm + 2 * np.array(planned["facets"][0][:3])))
+    write_mesh(path, mesh.with_vertices(mesh.vertices_mm + 2 * np.array(planned["facets"][0][:3])))
 
 
 def points_at_nan(content: bytes) -> bytes:

@@ -188,7 +188,7 @@ def views(*poses: object) -> Make:
     return make
 
 
-HERE = np.eye(4).tolist()
+IDENTITY = np.eye(4).tolist()
 
 
 @attacks(
@@ -203,13 +203,13 @@ HERE = np.eye(4).tolist()
         "depth_of_8_bits": depth(lambda _: png(848, 480, 8, bytes(849) * 480)),
         "depth_claims_gigapixels": depth(lambda _: png(60000, 60000, 16, bytes(10_000_000))),
         "depth_all_zero": depth(lambda _: png(848, 480, 16, bytes(1 + 2 * 848) * 480)),
-        "poses_of_one_view": views(HERE),
-        "poses_mirrored": views(HERE, np.diag([1.0, 1, -1, 1]).tolist()),
-        "poses_at_1e300": views(HERE, [*HERE[:2], [0, 0, 1, 1e300], [0, 0, 0, 1]]),
-        "poses_100_m_away": views(HERE, [[1, 0, 0, 1e5], *HERE[1:]]),
-        "poses_are_a_fifo": special(views(HERE, HERE), "fifo", "poses.json"),
+        "poses_of_one_view": views(IDENTITY),
+        "poses_mirrored": views(IDENTITY, np.diag([1.0, 1, -1, 1]).tolist()),
+        "poses_at_1e300": views(IDENTITY, [*IDENTITY[:2], [0, 0, 1, 1e300], [0, 0, 0, 1]]),
+        "poses_100_m_away": views(IDENTITY, [[1, 0, 0, 1e5], *IDENTITY[1:]]),
+        "poses_are_a_fifo": special(views(IDENTITY, IDENTITY), "fifo", "poses.json"),
     },
-    either={"poses_from_behind": views(HERE, np.diag([1.0, -1, -1, 1]).tolist())},
+    either={"poses_from_behind": views(IDENTITY, np.diag([1.0, -1, -1, 1]).tolist())},
 )
 def test_depth_images_and_views(make, end, room):
     check(make, end, room)
@@ -271,7 +271,10 @@ def alone(*places: tuple[float, float, float]) -> Make:
         "of_1000_touches": told(*[TOUCH] * 1000),
         "a_metre_off": touch(place_mm=[900.0, 0.0, 900.0]),
         "all_is_free": told(
-            {"kind": "free", "places_mm": [[x, y, 150.0] for x in range(30) for y in range(30)]}
+            {
+                "kind": "free_space",
+                "places_mm": [[x, y, 150.0] for x in range(30) for y in range(30)],
+            }
         ),
         "of_one_place_50_times_sure": told(*[{**TOUCH, "std_mm": 0.05}] * 50),
     },

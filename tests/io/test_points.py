@@ -82,13 +82,13 @@ def test_the_occupancy_cloud_says_where_its_points_were_in_the_ct(tmp_path):
     assert columns["ct_x"].dtype == np.float32
     ct = np.stack([columns[f"ct_{axis}"] for axis in "xyz"], axis=1).astype(float)
     camera = np.stack([columns[axis] for axis in "xyz"], axis=1).astype(float)
-    np.testing.assert_allclose(Wave().carry(ct), camera, atol=1e-3)
+    np.testing.assert_allclose(Wave().forward(ct), camera, atol=1e-3)
     assert np.linalg.norm(ct - MIDDLE, axis=1).max() < 15
     read_back, _ = read_cloud(tmp_path / "out" / "occupancy.ply")
     np.testing.assert_array_equal(read_back.points_mm, estimate.cloud.points_mm)
 
 
-@pytest.mark.parametrize("motion", [None, OneWay(Wave().carry)])
+@pytest.mark.parametrize("motion", [None, OneWay(Wave().forward)])
 def test_without_a_way_back_the_cloud_has_no_places_in_the_ct(tmp_path, motion):
     write_estimate(tmp_path / "out", located(motion))
     assert "ct_x" not in ply_columns(tmp_path / "out" / "occupancy.ply")
@@ -106,7 +106,7 @@ def test_points_keep_their_columns_and_get_their_place(tmp_path, names):
     table = read_points(path)
     np.testing.assert_array_equal(table.points_ct, points)
     rows = rows_of(camera_table(table, Wave()).decode())
-    np.testing.assert_allclose(places(rows), Wave().carry(points), atol=6e-5)
+    np.testing.assert_allclose(places(rows), Wave().forward(points), atol=6e-5)
     assert list(rows[0])[0::4] == ["name", "why"]
     assert [row["name"] for row in rows] == [f"v{n}" for n in range(len(points))]
     assert rows[2]["why"] == "a, b"
@@ -157,7 +157,7 @@ def test_fiducial_lists_honour_their_coordinate_system(tmp_path, system, place):
     rows = rows_of(camera_table(table, Wave()).decode())
     assert (rows[0]["label"], rows[0]["description"]) == ("hilum", "vein, left")
     np.testing.assert_array_equal(places(rows, "ct"), table.points_ct)
-    np.testing.assert_allclose(places(rows), Wave().carry(table.points_ct), atol=6e-5)
+    np.testing.assert_allclose(places(rows), Wave().forward(table.points_ct), atol=6e-5)
 
 
 def test_a_fiducial_may_begin_with_the_sign_of_a_comment(tmp_path):
@@ -280,7 +280,7 @@ def test_a_motion_without_an_answer_is_no_answer(tmp_path):
 
 @pytest.fixture
 def cloud(tmp_path):
-    points = Wave().carry(anatomy().organ.vertices_mm).astype(np.float32)
+    points = Wave().forward(anatomy().organ.vertices_mm).astype(np.float32)
     write_cloud_ply(tmp_path / "cloud.ply", points)
     return tmp_path / "cloud.ply"
 

@@ -48,7 +48,7 @@ READERS = {
     "evidence": Reader(
         read_evidence,
         "piece,frame,kind,x_mm,y_mm,z_mm,stamp_ns,tool",
-        (f"1,camera,touch,1.5,2,150,{STAMP_NS},probe", "2,camera,free,3,4,140,0,grasper"),
+        (f"1,camera,touch,1.5,2,150,{STAMP_NS},probe", "2,camera,free_space,3,4,140,0,grasper"),
         "y_mm",
     ),
     "points": Reader(

@@ -13,8 +13,8 @@ from camera_objects import ASIDE, BASE, MS, Led, Located, Tape, played, seen_at
 from live_objects import STAMP_NS, small_estimate
 from refused import refused
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.evidence import Held
-from tumortrack.core.geometry import HERE, rigid
+from tumortrack.core.evidence import Grasp
+from tumortrack.core.geometry import IDENTITY, rigid
 from tumortrack.live.cameras import camera_setup
 from tumortrack.live.poses import FilePoses, PoseBuffer
 from tumortrack.live.values import PublishedFrame, SourceLost
@@ -32,9 +32,9 @@ def test_frames_of_about_one_moment_go_together():
         "cameras 1, 2",  # that frame of 90 ms
     ]
     assert [len(others) for _, others in tracker.asked[:4]] == [1, 1, 0, 1]
-    (look,) = tracker.asked[1][1]
-    np.testing.assert_allclose(look.camera_from_look, ASIDE, atol=1e-9)
-    assert look.seen.stamp_ns == STAMP_NS + 40 * MS
+    (view,) = tracker.asked[1][1]
+    np.testing.assert_allclose(view.camera_from_view, ASIDE, atol=1e-9)
+    assert view.full_view.stamp_ns == STAMP_NS + 40 * MS
     assert [view.number for view in told[1].views] == [1, 2]
     assert told[1].estimate.report.cameras == (1, 2)
     assert report["cameras"]["1"] == 4
@@ -96,7 +96,7 @@ def test_a_source_that_can_never_work_ends_the_run():
 
 
 def test_results_of_a_camera_that_moves_are_in_the_fixed_frame_and_missing_poses_are_said():
-    published = PublishedFrame("base", HERE, calibrated=True, moves=True)
+    published = PublishedFrame("base", IDENTITY, calibrated=True, moves=True)
     tracker = Located()
     told, _ = played([Tape(0, 33, 66, 99)], Led(STAMP_NS + 99 * MS), published, tracker=tracker)
     centers = np.array([one.center_mm("kidney") for one in told[:3]])
@@ -200,7 +200,7 @@ class Holding:
 
     def evidence(self, camera_from_published, stamp_ns):
         place_mm = tuple(camera_from_published[:3, 3].tolist())
-        return (Held(point_ct=(1.0, 2.0, 3.0), place_mm=place_mm, stamp_ns=stamp_ns),)
+        return (Grasp(point_ct=(1.0, 2.0, 3.0), place_mm=place_mm, stamp_ns=stamp_ns),)
 
     def act(self, result):
         return result

@@ -72,12 +72,12 @@ def test_a_sink_that_cannot_open_its_file_is_a_clear_line(example, tmp_path):
         named_sinks(["csv:a.csv", "csv:a.csv"])
 
 
-def test_track_uses_it_by_its_text(phantom_case, clinic_model, tmp_path):
+def test_track_uses_it_by_its_text(phantom_case, elastic_model, tmp_path):
     folders = installed_example(tmp_path / "site")
     table = tmp_path / "centres.csv"
     report = tmp_path / "report.json"
     arguments = (f"virtual:{phantom_case}?fps=10", f"csv:{table}", "--report", report)
-    world = World(phantom_case, clinic_model)
+    world = World(phantom_case, elastic_model)
     ended_when(start(world, *arguments, env=finding(folders)), lambda: estimates(report) > 1)
     rows = [line.split(",") for line in table.read_text().splitlines()[1:]]
     assert {row[2] for row in rows} >= {"kidney", "tumor_1"}

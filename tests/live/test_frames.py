@@ -21,10 +21,10 @@ from tumortrack.live.values import Observation, PublishedFrame, SourceLost
 from tumortrack.live.views import FrameCheck
 from tumortrack.live.workers import OPENING_S, SourceWorker
 
-HERE = PublishedFrame()
+IDENTITY = PublishedFrame()
 
 
-def results(*items, tracker=None, published=HERE, **config):
+def results(*items, tracker=None, published=IDENTITY, **config):
     """The loop's result of each frame."""
     given = {"region": ALL, "stale_s": PATIENCE_S / 2, **config}
     return played([Tape(*items)], published=published, tracker=tracker, config=LoopConfig(**given))[
@@ -67,7 +67,7 @@ def test_two_images_without_return_where_they_differ_are_two():
     one, other = small_frame(), small_frame(STAMP_NS + 1000 * MS)
     depth_mm = other.depth_mm.copy()
     depth_mm[0, 0] = np.nan
-    check = FrameCheck(HERE, ALL, 0.25)
+    check = FrameCheck(IDENTITY, ALL, 0.25)
     check.check_new(one)
     check.check_new(replace(other, depth_mm=depth_mm))
     with pytest.raises(NoEstimate) as refused:
@@ -85,7 +85,7 @@ def test_a_frame_that_is_only_late_or_out_of_order_makes_nobody_forget():
 
 
 def test_a_clock_that_jumps_back_costs_frames_and_no_more():
-    told, report = played([Tape(*range(0, 160, 40), *range(-9000, -8800, 40))], published=HERE)
+    told, report = played([Tape(*range(0, 160, 40), *range(-9000, -8800, 40))], published=IDENTITY)
     assert found(told) == [True] * 4 + [False] * 2 + [True] * 3
     assert report["clock_jumps"] == 1
 
@@ -158,7 +158,7 @@ def test_garbage_and_defects_are_said_and_survived():
     nothing = np.full((48, 64), np.nan, np.float32)
     empty = DepthFrame(nothing, CAMERA, STAMP_NS + 80 * MS)
     items = [0, 40, InputError("no points"), empty, 120, 160]
-    told, report = played([Tape(*items)], published=HERE, tracker=Broken())
+    told, report = played([Tape(*items)], published=IDENTITY, tracker=Broken())
     assert found(told) == [True, True, False, False, False, True]
     assert told[2].reason == "no points"
     assert kinds(told)[4] == "defect"
@@ -182,7 +182,7 @@ def test_stale_frames_are_refused_and_so_are_those_from_the_future(clock):
     items = [frame(-600), lambda: until(lambda: sink.updates), frame(1000)]
     items += [lambda: until(lambda: len(sink.updates) > 1), frame(1001)]
     tape = Tape(*items, lossless=False, host_clock=True, on_demand=False)
-    told, report = played([tape], published=HERE, config=LoopConfig(region=ALL), sink=sink)
+    told, report = played([tape], published=IDENTITY, config=LoopConfig(region=ALL), sink=sink)
     assert kinds(told)[:2] == ["stale", "future"]
     assert told[0].latency_ms == pytest.approx(600)
     assert report["latency_from"] == "stamp"
@@ -202,7 +202,7 @@ def test_an_answer_that_comes_too_late_is_none_and_yet_a_start(clock, on_demand)
     items = [frames[0], lambda: until(lambda: sink.updates), frames[1]]
     tape = Tape(*items, lossless=False, host_clock=True, on_demand=on_demand)
     told, _ = played(
-        [tape], published=HERE, config=LoopConfig(region=ALL), tracker=tracker, sink=sink
+        [tape], published=IDENTITY, config=LoopConfig(region=ALL), tracker=tracker, sink=sink
     )
     assert kinds(told)[0] == ("" if on_demand else "too_late")
     assert found(told)[0] == on_demand
@@ -365,7 +365,7 @@ def test_only_a_camera_is_opened_again_because_it_is_silent(clock, on_demand):
 def test_a_source_that_stays_away_ends_the_loop_and_stop_ends_it_from_elsewhere():
     config = LoopConfig(region=ALL, stale_s=0.1, give_up_s=0.4)
     with pytest.raises(SourceLost):
-        played([Tape(threading.Event().wait, on_demand=False)], published=HERE, config=config)
+        played([Tape(threading.Event().wait, on_demand=False)], published=IDENTITY, config=config)
     loop = Loop(Located(), small_setting(), LoopConfig(region=ALL, stale_s=0.1))
     reader = SourceWorker(lambda: Tape(threading.Event().wait))
     threading.Timer(0.3, loop.stop).start()

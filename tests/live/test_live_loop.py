@@ -16,10 +16,10 @@ from tumortrack.live.values import Controls, PublishedFrame, SinkContext
 from tumortrack.live.workers import SourceWorker
 from tumortrack.segmentation import RegionConfig
 from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
-from warp_objects import ANATOMY, slim_clinic
+from warp_objects import ANATOMY, slim_elastic
 
 FRAME_NS = 33_000_000
-WHOLE = RegionConfig(plane=False, flying=False, pieces=False, crop=slim_clinic().scene.cloud)
+WHOLE = RegionConfig(plane=False, flying=False, pieces=False, crop=slim_elastic().scene.cloud)
 CONFIG = LoopConfig(region=WHOLE, stale_s=PATIENCE_S / 2)
 
 
@@ -44,9 +44,9 @@ def test_following_is_no_worse_than_locating_alone(tracker, stages):
         clouds = moving(stage, 6)
         for cloud in clouds:
             last = tracker.follow(cloud, last)
-        truth = stage.carry(targets) + 5 * np.array([0.4, -0.2, 0.1])
+        truth = stage.forward(targets) + 5 * np.array([0.4, -0.2, 0.1])
         for name, found in (("follow", last), ("alone", tracker.locate(clouds[-1], grid=16))):
-            off = np.linalg.norm(found.motion.carry(targets) - truth, axis=1)
+            off = np.linalg.norm(found.motion.forward(targets) - truth, axis=1)
             errors[name].append(off.mean())
         assert last.volume is None
         assert "follow" in last.report.timings
@@ -59,7 +59,7 @@ def test_points_that_are_carried_have_the_labels_of_where_they_are(tracker, stag
     estimate = tracker.follow(stages[0].cloud)
     cloud = estimate.cloud
     assert len(cloud.points_mm) == 20_000
-    back = estimate.motion.back(cloud.points_mm.astype(float)).astype(np.float32)
+    back = estimate.motion.inverse(cloud.points_mm.astype(float)).astype(np.float32)
     labels, margin_mm = tracker.model.shape.labels_at(back)
     clear = margin_mm > 0.05  # nearer to a surface, the way there and back may cross it
     np.testing.assert_array_equal(labels[clear], cloud.labels[clear])
@@ -151,9 +151,9 @@ def test_what_is_no_organ_gives_no_estimate_and_no_old_one(tracker, stages):
 
 def test_only_an_organ_found_good_a_moment_ago_may_have_been_turned_over(tracker, stages):
     class Watched(Tracker):
-        def follow(self, cloud, last=None, how=FollowOptions(), seen=None, **known):  # noqa: B008
-            asked.append(how.either_side)
-            found = super().follow(cloud, last, how, seen, **known)
+        def follow(self, cloud, last=None, how=FollowOptions(), full_view=None, **known):  # noqa: B008
+            asked.append(how.allow_flip)
+            found = super().follow(cloud, last, how, full_view, **known)
             return found.assessed(finding=None if verdicts.pop(0) == "good" else poor("hidden"))
 
     asked, verdicts = [], ["poor", "good", "poor", "poor", "poor", "poor"]

@@ -156,12 +156,12 @@ def read():
 def test_ages_count_from_where_the_source_allows(read, lossless, host_clock, counts_from):
     reader = read(Tape(seen(7, 9), lossless=lossless, host_clock=host_clock))
     begin_ns = time.time_ns()
-    born_ns = reader.born_ns(reader.take(PATIENCE_S))
+    capture_ns = reader.capture_ns(reader.take(PATIENCE_S))
     assert reader.latency_from == counts_from
     if lossless:
-        assert begin_ns <= born_ns <= time.time_ns()
+        assert begin_ns <= capture_ns <= time.time_ns()
     else:
-        assert born_ns == (7 if host_clock else 9)
+        assert capture_ns == (7 if host_clock else 9)
 
 
 def test_the_newest_frame_wins_and_the_others_are_counted(read):

@@ -116,13 +116,13 @@ def test_clicks_reach_the_tool_of_that_name_and_what_was_left_out_is_counted():
     assert probe.clicks == 2
     assert not SETTING.controls.touched
     said = [
-        EvidenceReport(name="touch", off_mm=off_mm, news=0.5, left_out=off_mm > 9)
+        EvidenceReport(name="touch", off_mm=off_mm, information_gain=0.5, rejected=off_mm > 9)
         for off_mm in (30.0, 0.1, 20.0)  # the first is of an earlier frame
     ]
     estimate = reporting(small_estimate(), evidence=tuple(said))
     all_tools.located(view(), estimate)
     assert probe.seen == [estimate]
-    assert all_tools.summary()["probe"]["left_out"] == 1
+    assert all_tools.summary()["probe"]["rejected"] == 1
     update = replace(small_update(), estimate=estimate)
     assert re.findall(r"\d+", update.describe().split(";")[-1]) == ["1", "2"]  # used, left out
 

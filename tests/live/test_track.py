@@ -11,8 +11,8 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture
-def world(phantom_case, clinic_model):
-    return World(phantom_case, clinic_model)
+def world(phantom_case, elastic_model):
+    return World(phantom_case, elastic_model)
 
 
 def test_a_moving_case_is_followed_and_the_report_says_how_well(world, tmp_path):

@@ -23,8 +23,8 @@ TESTS = (
     "tests/report/test_renderer_kernels.py",
     "tests/registration/test_bend.py",
     "occupancy/tests/test_lattice_kernels.py",
-    "lab/tests/test_cut.py::test_voxels_near_electrodes_learn_how_far_these_are",
-    "lab/tests/test_world.py::test_the_bed_is_a_cubic_spline_of_its_grid_with_its_slope",
+    "benchmarks/tests/test_cut.py::test_voxels_near_electrodes_learn_how_far_these_are",
+    "benchmarks/tests/test_world.py::test_the_bed_is_a_cubic_spline_of_its_grid_with_its_slope",
 )
 
 

@@ -241,7 +241,7 @@ def test_swelling_changes_the_volume_by_what_is_taken_up(reduced, solid, modes, 
         field.astype(np.float32),
         np.array([state], np.float32),
     )
-    moved = ORGAN.moved(swollen.carry(state, ORGAN.vertices_mm))
+    moved = ORGAN.with_vertices(swollen.forward(state, ORGAN.vertices_mm))
     assert moved.volume_mm3 / ORGAN.volume_mm3 - 1 == pytest.approx(strain, rel=0.15)
 
 
@@ -273,9 +273,9 @@ def test_a_library_mixes_strong_and_weak_states(body):
 def test_every_state_keeps_the_volume_and_can_be_undone(body):
     changes, errors, moved = [], [], []
     for state in body.states:
-        carried = body.carry(state, ORGAN.vertices_mm)
-        changes.append(ORGAN.moved(carried).volume_mm3 / ORGAN.volume_mm3 - 1)
-        errors.append(np.abs(body.carry(-state, carried) - ORGAN.vertices_mm).max())
+        carried = body.forward(state, ORGAN.vertices_mm)
+        changes.append(ORGAN.with_vertices(carried).volume_mm3 / ORGAN.volume_mm3 - 1)
+        errors.append(np.abs(body.forward(-state, carried) - ORGAN.vertices_mm).max())
         moved.append(np.linalg.norm(carried - ORGAN.vertices_mm, axis=1).max())
     assert np.abs(changes).max() < 0.03
     assert max(errors) < 0.01
@@ -290,7 +290,7 @@ def test_no_state_folds_space(body):
     step = 0.25
     for state in body.states[np.argsort(np.linalg.norm(body.states, axis=1))[-15:]]:
         ahead, behind = (
-            np.stack([body.carry(state, points + sign * step * axis) for axis in np.eye(3)], -1)
+            np.stack([body.forward(state, points + sign * step * axis) for axis in np.eye(3)], -1)
             for sign in (1, -1)
         )
         determinant = np.linalg.det((ahead - behind) / (2 * step))
@@ -311,7 +311,7 @@ def test_points_follow_a_linear_field_to_its_exponential():
         np.zeros((2, 2), np.float32),
     )
     points = np.random.default_rng(0).uniform(-15, 15, (40, 3))
-    moved = body.carry(np.array([1.0, 0.0]), points)
+    moved = body.forward(np.array([1.0, 0.0]), points)
     np.testing.assert_allclose(moved, points @ expm(slope).T, atol=0.02)
     assert np.abs(moved - points).max() > 2
 
@@ -343,7 +343,7 @@ def test_a_body_survives_a_file(body, unchecked):
     back = ElasticBody.from_arrays(body.to_arrays())
     points = ORGAN.vertices_mm[::50]
     np.testing.assert_array_equal(
-        back.carry(body.states[0], points), body.carry(body.states[0], points)
+        back.forward(body.states[0], points), body.forward(body.states[0], points)
     )
     assert back.spacing_mm == body.spacing_mm
     lacking = {k: v for k, v in body.to_arrays().items() if k != "states"}
@@ -383,7 +383,7 @@ def test_scenes_draw_scaled_states_and_replay(body):
     gaps = np.abs(body.states * 0.5 - drawn.coefficients).max(1)
     assert gaps.min() < 1e-6
     points = ORGAN.vertices_mm[::20]
-    np.testing.assert_array_equal(drawn.apply(points), body.carry(drawn.coefficients, points))
+    np.testing.assert_array_equal(drawn.apply(points), body.forward(drawn.coefficients, points))
     again = config.sample(view, np.random.default_rng(1))
     np.testing.assert_array_equal(again.apply(points), drawn.apply(points))
     assert drawn.record() == {"kind": "elastic", "coefficients": drawn.coefficients.tolist()}

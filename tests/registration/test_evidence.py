@@ -17,8 +17,8 @@ from stories import answered, refusal, tumortrack
 from tumortrack.assessment.advice import Advisor
 from tumortrack.core.errors import InputError, NoEstimate, NotThisOrgan
 from tumortrack.core.evidence import (
-    Free,
-    Held,
+    FreeSpace,
+    Grasp,
     Landmark,
     Outline,
     Touch,
@@ -27,8 +27,8 @@ from tumortrack.core.report import Cause
 from tumortrack.core.types import Mesh, SensorCloud
 from tumortrack.io.evidence_files import evidence_json, read_evidence
 from tumortrack.io.ply import write_cloud_ply
-from tumortrack.registration.evidence import EvidenceTerms, Known, still_known
-from tumortrack.registration.looks import Looks
+from tumortrack.registration.evidence import EvidenceTerms, TrackedEvidence, propagate
+from tumortrack.registration.multi_view import MultiViewCloud
 from tumortrack.tracking.tracker import Follower, FollowerConfig
 from warp_objects import ANATOMY, method, nudged, placed, shape
 
@@ -37,7 +37,7 @@ TRUE = placed(share=0.3)
 VERTICES = ANATOMY.organ.vertices_mm
 NORMALS = (VERTICES - CENTER) / RADII**2
 NORMALS /= np.linalg.norm(NORMALS, axis=1, keepdims=True)
-MOVED = TRUE.carry(VERTICES)
+MOVED = TRUE.forward(VERTICES)
 FACING = -((NORMALS @ TRUE.rotation.T) * MOVED).sum(1) / np.linalg.norm(MOVED, axis=1)
 SEEN = MOVED[FACING > 0.3]
 BEHIND = VERTICES[FACING < -0.4]
@@ -46,7 +46,7 @@ TUMOR = ANATOMY.tumors[0].vertices_mm
 
 def at(point_ct):
     """Where the true organ has it."""
-    return tuple(map(float, TRUE.carry(np.atleast_2d(point_ct))[0]))
+    return tuple(map(float, TRUE.forward(np.atleast_2d(point_ct))[0]))
 
 
 def touches(count, noise_mm=0.3, seed=0):
@@ -63,12 +63,12 @@ def every_kind():
         Touch(place_mm=at(TUMOR[3]), part="tumor_1", std_mm=0.5),
         Landmark(point_ct=CENTER + [5, 1, -20], place_mm=at(CENTER + [5, 1, -20]), std_mm=1.5),
         Outline(places_mm=tuple(tumor), part="tumor_1"),
-        Free(places_mm=(inside, (0.0, 0.0, 20.0)), std_mm=2.0),
+        FreeSpace(places_mm=(inside, (0.0, 0.0, 20.0)), std_mm=2.0),
     ]
 
 
 def test_terms_change_as_their_derivatives_say():
-    terms = EvidenceTerms.of(every_kind(), NAMES)
+    terms = EvidenceTerms.from_evidence(every_kind(), NAMES)
     motion = placed(share=0.0)
     now, step = terms.at(motion), 1e-3
     assert len(now.residuals_mm) == 1 + 1 + 8 + 2 + 3 + (len(TUMOR[:: len(TUMOR) // 8]) - 8)
@@ -87,7 +87,9 @@ def test_terms_change_as_their_derivatives_say():
 
 def test_a_place_without_tissue_counts_inside_the_organ_alone():
     inside, outside = at(CENTER), (0.0, 0.0, 20.0)
-    terms = EvidenceTerms.of([Free(places_mm=(inside, outside), tip_mm=1.0)], NAMES).at(TRUE)
+    terms = EvidenceTerms.from_evidence(
+        [FreeSpace(places_mm=(inside, outside), tip_mm=1.0)], NAMES
+    ).at(TRUE)
     assert terms.residuals_mm[0] < -5
     assert terms.residuals_mm[1] == 0
     assert not terms.by_motion[1].any()
@@ -95,12 +97,12 @@ def test_a_place_without_tissue_counts_inside_the_organ_alone():
 
 
 def at_all(points_ct):
-    return TRUE.carry(points_ct)
+    return TRUE.forward(points_ct)
 
 
 def fitted(evidence):
-    looks = Looks.of([SEEN], (), EvidenceTerms.of(evidence, NAMES))
-    return method().register(looks)
+    views = MultiViewCloud.from_points([SEEN], (), EvidenceTerms.from_evidence(evidence, NAMES))
+    return method().register(views)
 
 
 def this_way_round():
@@ -112,13 +114,13 @@ def test_evidence_where_nothing_is_seen_brings_the_answer_nearer_and_makes_it_su
     outline = Outline(places_mm=tuple(map(at, TUMOR[::20])), part="tumor_1", std_mm=0.5)
     off_mm, std_mm = {}, {}
     for name, evidence in {"nothing": [], "touches": touches(12), "outline": [outline]}.items():
-        motion = replace(fitted(evidence).motion, rivals=())
-        off_mm[name] = np.linalg.norm(motion.carry(VERTICES) - MOVED, axis=1).mean()
+        motion = replace(fitted(evidence).motion, alternatives=())
+        off_mm[name] = np.linalg.norm(motion.forward(VERTICES) - MOVED, axis=1).mean()
         std_mm[name] = motion.std_mm(BEHIND).mean()
     assert max(std_mm["touches"], std_mm["outline"]) < 0.95 * std_mm["nothing"]
     assert off_mm["touches"] < 0.9 * off_mm["nothing"]
     turned = fitted(this_way_round()).motion  # an ellipsoid fits as well after half a turn
-    assert np.linalg.norm(turned.carry(VERTICES) - MOVED, axis=1).mean() < 3
+    assert np.linalg.norm(turned.forward(VERTICES) - MOVED, axis=1).mean() < 3
 
 
 def test_a_closed_structure_is_touched_and_outlined_as_a_part_is():
@@ -130,13 +132,15 @@ def test_a_closed_structure_is_touched_and_outlined_as_a_part_is():
     rest = replace(shape(), anatomy_ct=anatomy)
     true = replace(TRUE, shape=rest)
     told = Outline(places_mm=tuple(map(at, artery.vertices_mm[::40])), part="artery", std_mm=0.5)
-    terms = EvidenceTerms.of([told], tuple(anatomy.closed))
+    terms = EvidenceTerms.from_evidence([told], tuple(anatomy.closed))
     assert np.abs(terms.at(true).residuals_mm).max() < 0.3
-    fit = replace(method(), rest=rest).register(Looks.of([SEEN], (), terms))
-    off_mm = fit.motion.carry(artery.vertices_mm) - true.carry(artery.vertices_mm)
+    fit = replace(method(), rest=rest).register(MultiViewCloud.from_points([SEEN], (), terms))
+    off_mm = fit.motion.forward(artery.vertices_mm) - true.forward(artery.vertices_mm)
     assert np.linalg.norm(off_mm, axis=1).mean() < 2
     with refused(InputError, "sheet"):
-        EvidenceTerms.of([Touch(place_mm=at(CENTER), part="sheet")], tuple(anatomy.closed))
+        EvidenceTerms.from_evidence(
+            [Touch(place_mm=at(CENTER), part="sheet")], tuple(anatomy.closed)
+        )
 
 
 @pytest.mark.parametrize(
@@ -148,22 +152,22 @@ def test_many_that_agree_outvote_what_contradicts_them(tracker, agree, wrong, de
     cloud, right = SensorCloud(SEEN.astype(np.float32)), touches(agree)
     found = tracker.locate(cloud, grid=16, evidence=[*right, *false])
     told = found.report.evidence
-    assert [each.left_out for each in told] == [False] * agree + [True] * wrong
+    assert [each.rejected for each in told] == [False] * agree + [True] * wrong
     assert (found.finding is not None and found.finding.kind == "evidence") == decides
     if decides:
         assert found.finding.values["number"] > agree
     assert told[agree].off_mm == pytest.approx(25, abs=3)
-    assert told[agree].news == pytest.approx(0, abs=1e-9)
+    assert told[agree].information_gain == pytest.approx(0, abs=1e-9)
     assert told[agree].places_mm == (tuple(away),)
-    assert all(0 < each.news <= 1 for each in told[:agree])
+    assert all(0 < each.information_gain <= 1 for each in told[:agree])
     rest = tracker.locate(cloud, grid=16, evidence=right)
-    apart = found.motion.carry(VERTICES) - rest.motion.carry(VERTICES)
+    apart = found.motion.forward(VERTICES) - rest.motion.forward(VERTICES)
     assert np.linalg.norm(apart, axis=1).max() < 0.5
 
 
 def sides(motion):
     """What a camera sees of the organ, and the motion."""
-    moved = motion.carry(VERTICES)
+    moved = motion.forward(VERTICES)
     facing = -((NORMALS @ motion.rotation.T) * moved).sum(1) / np.linalg.norm(moved, axis=1)
     return SensorCloud(moved[facing > 0.3].astype(np.float32))
 
@@ -191,11 +195,13 @@ def test_what_was_touched_once_counts_while_the_organ_moves(tracker):
         for n, motion in enumerate(drifting()):
             new = evidence if n == 0 else ()
             found = follower.locate(stamped(sides(motion), n), evidence=new)
-            errors.append(np.linalg.norm(found.motion.carry(BEHIND) - motion.carry(BEHIND), axis=1))
+            errors.append(
+                np.linalg.norm(found.motion.forward(BEHIND) - motion.forward(BEHIND), axis=1)
+            )
             assert len(found.evidence) == len(evidence)
         off_mm[name] = np.mean(errors[1:])
         told = found.report.evidence
-        assert all(each.before and not each.left_out for each in told)
+        assert all(each.before and not each.rejected for each in told)
         assert all(1.5 < each.std_mm < 3 for each in told)  # 0.1 of some 16 mm, and 1 or 2 mm
         by_now = np.array([said.places_mm[0] for said in told])
         went_mm = np.linalg.norm(by_now - [piece.places[0] for piece in evidence], axis=1)
@@ -208,7 +214,7 @@ def test_many_touches_of_another_place_are_named_whether_or_not_the_organ_is_fou
     away = [Touch(place_mm=tuple(TRUE.centre_mm + [0, 0, -35.0]), std_mm=0.05)] * 60
     try:  # rounding decides which it is
         found = tracker.locate(cloud, grid=16, evidence=away)
-        named = found.quality == "poor" and all(each.left_out for each in found.report.evidence)
+        named = found.quality == "poor" and all(each.rejected for each in found.report.evidence)
     except NotThisOrgan as error:
         named = Cause.EVIDENCE in [likely.cause for likely in error.causes]
     assert named
@@ -241,23 +247,27 @@ def test_what_was_touched_is_still_known_when_the_organ_is_seen_again(tracker, a
 
 def test_touched_places_are_carried_as_the_tissue_goes():
     after = list(drifting())[-1]
-    landmark, held = (kind(point_ct=BEHIND[0], place_mm=at(BEHIND[0])) for kind in (Landmark, Held))
-    free = Free(places_mm=((0.0, 0.0, 20.0),))
+    landmark, held = (
+        kind(point_ct=BEHIND[0], place_mm=at(BEHIND[0])) for kind in (Landmark, Grasp)
+    )
+    free = FreeSpace(places_mm=((0.0, 0.0, 20.0),))
     outline = Outline(places_mm=tuple(map(at, TUMOR[:4])), part="tumor_1")
     pieces = [Touch(place_mm=at(BEHIND[0])), landmark, held, free, outline]
-    known, moved = still_known([Known(piece, TRUE) for piece in pieces], after)
+    known, moved = propagate([TrackedEvidence(piece, TRUE) for piece in pieces], after)
     assert [each.piece for each in known] == [pieces[0], landmark, outline]
     assert [each.name for each in moved] == ["touch", "landmark", "outline"]
-    there_mm = after.carry(BEHIND[:1])[0]
+    there_mm = after.forward(BEHIND[:1])[0]
     assert np.allclose(moved[0].place_mm, there_mm, atol=0.05)
     assert moved[1].place_mm == moved[0].place_mm
-    assert np.allclose(moved[2].places_mm, after.carry(TUMOR[:4]), atol=0.05)
+    assert np.allclose(moved[2].places_mm, after.forward(TUMOR[:4]), atol=0.05)
     way_mm = np.linalg.norm(there_mm - at(BEHIND[0]))
     assert moved[0].std_mm == pytest.approx(np.hypot(1.0, 0.1 * way_mm), rel=0.01)
     unsure = Touch(place_mm=at(BEHIND[0]), std_mm=6.0)
-    assert still_known([Known(unsure, TRUE)], TRUE) == ((), ())
-    many = [Known(Touch(place_mm=at(BEHIND[0]), stamp_ns=n + 1), TRUE) for n in range(900)]
-    kept, newest = still_known(many, TRUE)
+    assert propagate([TrackedEvidence(unsure, TRUE)], TRUE) == ((), ())
+    many = [
+        TrackedEvidence(Touch(place_mm=at(BEHIND[0]), stamp_ns=n + 1), TRUE) for n in range(900)
+    ]
+    kept, newest = propagate(many, TRUE)
     assert [each.stamp_ns for each in newest] == list(range(701, 901))
     assert [each.piece.stamp_ns for each in kept] == list(range(701, 901))
 
@@ -270,17 +280,17 @@ def test_what_a_tool_holds_is_where_the_tool_is_until_it_slips(tracker):
         follower = Follower(tracker, FollowerConfig())
         follower.begin(first)
         for n, motion in enumerate(drifting()):
-            place = tuple(motion.carry(tip_mm[None])[0])
-            held = Held(point_ct=tuple(tip_mm), place_mm=place, point_std_mm=0.3, std_mm=0.3)
+            place = tuple(motion.forward(tip_mm[None])[0])
+            held = Grasp(point_ct=tuple(tip_mm), place_mm=place, point_std_mm=0.3, std_mm=0.3)
             new = [held] if kind == "held" else []
             found = follower.locate(stamped(sides(motion), n + 1), evidence=new)
             assert len(found.evidence) == len(new)
-        errors[kind] = np.linalg.norm(found.motion.carry(tip_mm[None])[0] - place)
+        errors[kind] = np.linalg.norm(found.motion.forward(tip_mm[None])[0] - place)
     assert errors["held"] < min(0.8 * errors["nothing"], 1.0)
     slipped = msgspec.structs.replace(held, place_mm=tuple(np.array(place) + [0, 0, -25.0]))
     found = follower.locate(stamped(sides(motion), n + 2), evidence=[slipped])
     assert found.evidence == ()
-    assert found.report.evidence[0].left_out
+    assert found.report.evidence[0].rejected
 
 
 @pytest.mark.parametrize(
@@ -295,7 +305,9 @@ def test_what_a_tool_holds_is_where_the_tool_is_until_it_slips(tracker):
         lambda: Touch(place_mm=(0.02, 0.01, 0.15)),  # metres
         lambda: Touch(place_mm=(0.0, 0.0, 100.0), tip_mm=-1.0),
         lambda: Touch(place_mm=(0.0, 0.0, 100.0), std_mm=0.0),
-        lambda: EvidenceTerms.of([Outline(places_mm=((0, 0, 100.0),), part="liver")], NAMES),
+        lambda: EvidenceTerms.from_evidence(
+            [Outline(places_mm=((0, 0, 100.0),), part="liver")], NAMES
+        ),
     ],
 )
 def test_what_is_not_allowed_is_refused(make):
@@ -304,21 +316,21 @@ def test_what_is_not_allowed_is_refused(make):
 
 
 def test_the_touches_that_would_tell_most_tell_as_much_as_they_say():
-    bent = method().bend(fitted([]))
-    motion = replace(bent.motion, rivals=())
+    compliant = method().refine_compliance(fitted([]))
+    motion = replace(compliant.motion, alternatives=())
     planned = Advisor(motion, 1).touches()
     stds_mm = [planned[0].std_mm, *(each.then_std_mm for each in planned)]
     assert np.all(np.diff(stds_mm) < 0)
     places_mm = np.array([each.place_mm for each in planned])
-    apart_mm = np.linalg.norm(places_mm[:, None] - places_mm, axis=2)
-    assert apart_mm[np.triu_indices(3, 1)].min() > 10
+    distance_mm = np.linalg.norm(places_mm[:, None] - places_mm, axis=2)
+    assert distance_mm[np.triu_indices(3, 1)].min() > 10
     how = {"std_mm": 1.0, "shared_std_mm": 1.0, "tool": "pointer"}
     touched = [Touch(place_mm=place, **how) for place in places_mm]
-    looks = replace(bent.looks, evidence=EvidenceTerms.of(touched, NAMES))
-    terms = looks.evidence.at(bent.motion)
-    precision = np.linalg.inv(bent.motion.covariance)
+    views = replace(compliant.views, evidence=EvidenceTerms.from_evidence(touched, NAMES))
+    terms = views.evidence.at(compliant.motion)
+    precision = np.linalg.inv(compliant.motion.covariance)
     terms.add_to(precision, np.zeros(len(precision)))
-    middle = bent.motion.effects(bent.motion.shape.middles_ct[[1]])[0]
+    middle = compliant.motion.effects(compliant.motion.shape.middles_ct[[1]])[0]
     found = np.linalg.eigvalsh(middle @ np.linalg.inv(precision) @ middle.T)[-1] ** 0.5
     assert found == pytest.approx(stds_mm[-1], rel=0.02)
 
@@ -334,7 +346,7 @@ TABLE = """piece,frame,kind,part,x_mm,y_mm,z_mm,std_mm,tip_mm,x_ct_mm,y_ct_mm,z_
 def test_a_file_comes_back_a_table_says_the_same_and_what_is_older_than_the_pose_is_refused(
     tmp_path,
 ):
-    held = Held(point_ct=CENTER, place_mm=at(CENTER), tool="gripper", stamp_ns=5)
+    held = Grasp(point_ct=CENTER, place_mm=at(CENTER), tool="gripper", stamp_ns=5)
     evidence = (*every_kind(), held)
     (tmp_path / "e.json").write_bytes(evidence_json(evidence))
     assert read_evidence(tmp_path / "e.json")[1] == evidence
@@ -395,7 +407,7 @@ def test_touches_alone_are_an_answer(slim_model, tmp_path):
     assert report["cloud_sha256"] is None
     told = report["evidence"]
     assert [each["name"] for each in told] == ["touch"] * 40 + ["landmark"] * 2
-    assert not any(each["left_out"] for each in told)
+    assert not any(each["rejected"] for each in told)
     found_mm = np.array(report["parts"]["tumor_1"]["center_mm"])
     assert np.linalg.norm(found_mm - at_all(TUMOR).mean(0)) < 3
     file.write_bytes(evidence_json(tuple(evidence[:11])))
@@ -445,9 +457,9 @@ def test_in_a_frame_of_its_own_evidence_has_its_answer_there(tracker, slim_model
     for place in ("center_mm", "box_mm"):
         a, b = (np.array(getattr(f.report.parts["tumor_1"], place)) for f in (here, there))
         np.testing.assert_allclose(b - a, np.broadcast_to(away_mm, a.shape), atol=0.3)
-    moved = there.motion.carry(VERTICES) - here.motion.carry(VERTICES)
+    moved = there.motion.forward(VERTICES) - here.motion.forward(VERTICES)
     np.testing.assert_allclose(moved, np.tile(away_mm, (len(VERTICES), 1)), atol=0.5)
-    off_mm = there.meshes["kidney"].vertices_mm - there.motion.carry(VERTICES)
+    off_mm = there.meshes["kidney"].vertices_mm - there.motion.forward(VERTICES)
     assert np.abs(off_mm).max() < 0.1
     for a, b in zip(there.report.evidence, shifted(told, away_mm), strict=True):
         np.testing.assert_allclose(a.places_mm, b.places, atol=1e-6)
@@ -467,9 +479,9 @@ def test_one_wrong_plane_of_many_is_named_and_moves_nothing(tracker):
     right = tracker.locate(NOTHING, grid=16, evidence=told)
     told[4:5] = shifted(told[4:5], [0, 0, 22.0])
     found = tracker.locate(NOTHING, grid=16, evidence=told)
-    assert [n for n, each in enumerate(found.report.evidence) if each.left_out] == [4]
+    assert [n for n, each in enumerate(found.report.evidence) if each.rejected] == [4]
     assert found.report.evidence[4].off_mm > 10
-    away_mm = found.motion.carry(VERTICES) - right.motion.carry(VERTICES)
+    away_mm = found.motion.forward(VERTICES) - right.motion.forward(VERTICES)
     assert np.linalg.norm(away_mm, axis=1).mean() < 1.0
 
 

@@ -77,9 +77,9 @@ def test_points_go_where_a_plain_loop_takes_them(count):
     assert np.linalg.norm(truth - points, axis=1).max() > (1 if count > 1 else 0)
     np.testing.assert_allclose(body.follow(velocity, points), truth, atol=2e-4)
     carried = (truth - body.center_ct) @ TURNED.T + PLACE_MM
-    np.testing.assert_allclose(motion.carry(points), carried, atol=2e-4)
+    np.testing.assert_allclose(motion.forward(points), carried, atol=2e-4)
     rest = body.follow(-velocity, (carried - PLACE_MM) @ TURNED + body.center_ct)
-    np.testing.assert_allclose(motion.back(carried), rest, atol=2e-4)
+    np.testing.assert_allclose(motion.inverse(carried), rest, atol=2e-4)
 
 
 def test_parts_are_all_done_once_and_errors_come_back():
@@ -99,7 +99,7 @@ def test_parts_are_all_done_once_and_errors_come_back():
 @pytest.mark.parametrize("state", [5, 73])
 def test_sums_are_those_of_the_rows_and_rows_those_of_plain_arithmetic(state):
     body, motion = shape().body, placed(state)
-    points = motion.carry(ANATOMY.organ.vertices_mm[::5]).astype(np.float32)
+    points = motion.forward(ANATOMY.organ.vertices_mm[::5]).astype(np.float32)
     points += np.random.default_rng(1).normal(0, 1.5, points.shape).astype(np.float32)
     motion = replace(motion, coefficients=0.9 * motion.coefficients)
     rows = motion.residual_rows(points).astype(float)
@@ -159,7 +159,7 @@ def plainly_refined(points, start, config):
 @pytest.mark.parametrize("steps", [0, 20])
 def test_a_refinement_is_that_of_a_plain_loop(steps):
     config, start = GaussNewtonConfig(steps=steps), nudged(placed(), [3, -2, 5], [0.1, -0.05, 0.1])
-    points = placed().carry(ANATOMY.organ.vertices_mm[::3])
+    points = placed().forward(ANATOMY.organ.vertices_mm[::3])
     fit = refined(points, start, config)
     (rotation, centre, coefficients), cost, gone = plainly_refined(points, start, config)
     assert fit.steps == gone
@@ -172,7 +172,7 @@ def test_a_refinement_is_that_of_a_plain_loop(steps):
 
 
 def test_a_descent_goes_on_where_it_was_stopped():
-    points = placed().carry(ANATOMY.organ.vertices_mm[::3])
+    points = placed().forward(ANATOMY.organ.vertices_mm[::3])
     start = nudged(placed(), [3, -2, 5], [0.1, -0.05, 0.1])
     whole = refined(points, start)
     halves = descent(points, start)
@@ -209,7 +209,7 @@ def test_the_nearest_place_is_nearest_but_for_a_nodes_width():
 
 
 def test_covariances_follow_from_where_small_changes_take_points():
-    """Finite differences of ``carry`` by each unknown; modes halfway are of first order."""
+    """Finite differences of ``forward`` by each unknown; modes halfway are of first order."""
     points, mixed = about(60, 4, 0.9), np.random.default_rng(3).normal(size=(26, 26)) * 0.05
     base = replace(placed(share=0.3), covariance=mixed @ mixed.T)
     slopes, small = [], 1e-2
@@ -220,7 +220,7 @@ def test_covariances_follow_from_where_small_changes_take_points():
                 rotation=base.rotation @ Rotation.from_rotvec(sign * unit[3:6]).as_matrix(),
                 centre_mm=base.centre_mm + sign * base.rotation @ unit[:3],
                 coefficients=base.coefficients + sign * unit[6:],
-            ).carry(points)
+            ).forward(points)
             for sign in (1, -1)
         )
         slopes.append((ahead - behind) / (2 * small))
@@ -243,7 +243,7 @@ def test_covariances_follow_from_where_small_changes_take_points():
 
 def test_frames_leave_no_memory_behind(slim_model, unchecked):
     locator = RegistrationLocator(load_model(slim_model, "cpu"))
-    vertices = placed().carry(ANATOMY.organ.vertices_mm)
+    vertices = placed().forward(ANATOMY.organ.vertices_mm)
     seen = vertices[vertices[:, 2] < np.median(vertices[:, 2])]
     rng, last, sizes = np.random.default_rng(0), None, []
     tracemalloc.start()

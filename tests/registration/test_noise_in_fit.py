@@ -15,18 +15,18 @@ from tumortrack.core.types import DepthError, PointNoise
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import RegistrationResult, refine
 from tumortrack.registration.in_distribution import RIVAL_COST
-from tumortrack.registration.looks import Looks, depth_share, kernel_width_mm, lies_on
-from tumortrack.registration.registration import likeliest
+from tumortrack.registration.multi_view import MultiViewCloud, depth_share, kernel_width_mm, lies_on
+from tumortrack.registration.registration import select_best
 from warp_objects import ANATOMY, method, placed, shape
 
 CONFIG, ORGAN, MOTION = GaussNewtonConfig(), ANATOMY.organ, placed()
-SEEN = deproject(render_depth(MOTION.carry(ORGAN.vertices_mm), ORGAN.faces, d405(424, 240)))
+SEEN = deproject(render_depth(MOTION.forward(ORGAN.vertices_mm), ORGAN.faces, d405(424, 240)))
 FRONT = SEEN[np.random.default_rng(0).choice(len(SEEN), 1500, replace=False)]
 
 
-def looks_of(points, noise=None, **more):
+def views_of(points, noise=None, **more):
     noises = () if noise is None else [noise]
-    return Looks.of([np.asarray(points, np.float32)], noises=noises, **more)
+    return MultiViewCloud.from_points([np.asarray(points, np.float32)], noises=noises, **more)
 
 
 def noisy_front(noise_mm, seed):
@@ -42,21 +42,21 @@ def noisy_front(noise_mm, seed):
 def test_a_right_fits_cost_grows_by_what_is_foreseen(noise_mm):
     noise, costs = PointNoise(noise_mm, noise_mm, 0.0), []
     for places, known in ((FRONT, PointNoise()), (noisy_front(noise_mm, 1), noise)):
-        looks, width = looks_of(places, known), kernel_width_mm(CONFIG, noise)
-        squares = MOTION.residual_rows(looks.points_mm)[:, -1] ** 2
-        costs.append(looks.weight(CONFIG) * (squares / (1 + squares / width**2)).sum())
-        foreseen = looks.noise_cost(CONFIG)
+        views, width = views_of(places, known), kernel_width_mm(CONFIG, noise)
+        squares = MOTION.residual_rows(views.points_mm)[:, -1] ** 2
+        costs.append(views.weight(CONFIG) * (squares / (1 + squares / width**2)).sum())
+        foreseen = views.noise_cost(CONFIG)
     assert foreseen == pytest.approx(costs[1] - costs[0], rel=0.25)
-    shared = looks_of(FRONT, PointNoise(noise_mm, noise_mm, 0.2))
+    shared = views_of(FRONT, PointNoise(noise_mm, noise_mm, 0.2))
     whole = 1 / (CONFIG.sigma_mm**2 / CONFIG.n_effective + 0.2**2)
     assert len(FRONT) * shared.weight(CONFIG) == pytest.approx(whole)
 
 
 def test_noise_makes_no_outliers():
     points = noisy_front(2.0, 2)
-    quiet = refine(shape(), looks_of(points), MOTION, CONFIG)
-    told = refine(shape(), looks_of(points, PointNoise(2.0, 2.0, 0.05)), MOTION, CONFIG)
-    assert told.strays < 0.01 < quiet.strays
+    quiet = refine(shape(), views_of(points), MOTION, CONFIG)
+    told = refine(shape(), views_of(points, PointNoise(2.0, 2.0, 0.05)), MOTION, CONFIG)
+    assert told.outliers < 0.01 < quiet.outliers
 
 
 def test_noise_does_not_make_the_organ_larger():
@@ -65,30 +65,30 @@ def test_noise_does_not_make_the_organ_larger():
     for noise_mm, found in times.items():
         for seed in range(6):
             noise = PointNoise(noise_mm, noise_mm, 0.03 * noise_mm)
-            looks = looks_of(noisy_front(noise_mm, seed), noise)
-            fit = refine(shape(), looks, MOTION, CONFIG)
-            found.append(looks.apparent_size(fit.motion, CONFIG).times)
+            views = views_of(noisy_front(noise_mm, seed), noise)
+            fit = refine(shape(), views, MOTION, CONFIG)
+            found.append(views.apparent_size(fit.motion, CONFIG).times)
     larger = np.subtract(times[1.0], times[0.0])
     assert np.mean(larger) < 0.035  # 0.055 where the product has a mean
 
 
 def test_a_lobe_that_was_left_out_is_found_again():
     """Of the points a third was taken for another piece; a lump of something else lies beside."""
-    hidden = MOTION.carry(ORGAN.vertices_mm)
+    hidden = MOTION.forward(ORGAN.vertices_mm)
     hidden = hidden[hidden[:, 2] > np.percentile(hidden[:, 2], 90)]  # its far side
     assert lies_on(MOTION, FRONT, 2.0).mean() > 0.97
     assert not lies_on(MOTION, hidden, 2.0).any()
     right = FRONT[:, 0] > np.percentile(FRONT[:, 0], 66)
     lump = FRONT[right][:200] + [0, 0, -12.0]
     candidates = np.concatenate([FRONT[right], lump]).astype(np.float32)
-    looks = looks_of(FRONT[~right], candidates_mm=candidates)
-    first = refine(shape(), looks, MOTION, CONFIG)
-    whole = method().with_all_points(first, looks)
-    taken = len(whole.looks.points_mm) - (~right).sum()
+    views = views_of(FRONT[~right], candidates_mm=candidates)
+    first = refine(shape(), views, MOTION, CONFIG)
+    whole = method().with_all_points(first, views)
+    taken = len(whole.views.points_mm) - (~right).sum()
     assert taken == pytest.approx(right.sum(), abs=0.05 * right.sum())
     middles = ORGAN.vertices_mm[::7] * 0.5 + ORGAN.vertices_mm.mean(0) * 0.5
     off_mm = [
-        np.linalg.norm(fit.motion.carry(middles) - MOTION.carry(middles), axis=1).mean()
+        np.linalg.norm(fit.motion.forward(middles) - MOTION.forward(middles), axis=1).mean()
         for fit in (whole, first)
     ]
     assert off_mm[0] < off_mm[1]
@@ -126,7 +126,7 @@ def test_a_cameras_depths_widen_along_the_line_of_sight():
     motion, points = replace(MOTION, covariance=1e-4 * np.eye(26)), ORGAN.vertices_mm[:50:10]
     wider = replace(motion, depth_share=0.02).covariance_mm2(points) - motion.covariance_mm2(points)
     draws = 1 + 0.02 * np.random.default_rng(4).standard_normal(40_000)
-    for covariance, place in zip(wider, motion.carry(points), strict=True):
+    for covariance, place in zip(wider, motion.forward(points), strict=True):
         np.testing.assert_allclose(covariance, np.cov((draws[:, None] * place).T), atol=0.12)
 
 
@@ -134,12 +134,12 @@ def test_a_cameras_depths_widen_along_the_line_of_sight():
 
 
 def fit_of(motion, cost):
-    looks = Looks.of([np.zeros((3, 3))])
-    return RegistrationResult(motion, looks, cost, 0.0, cost, np.zeros(3), 1, np.zeros(6))
+    views = MultiViewCloud.from_points([np.zeros((3, 3))])
+    return RegistrationResult(motion, views, cost, 0.0, cost, np.zeros(3), 1, np.zeros(6))
 
 
 def best_of(*fits):
-    return likeliest(fits, method().prior)
+    return select_best(fits, method().prior)
 
 
 def test_two_minima_widen_the_covariance_by_their_distance():
@@ -147,18 +147,18 @@ def test_two_minima_widen_the_covariance_by_their_distance():
     away = replace(motion, centre_mm=motion.centre_mm + [0, 6.0, 0])
     best = best_of(fit_of(away, 12.0), fit_of(motion, 10.0))
     share = math.exp(-1) / (1 + math.exp(-1))
-    assert (best.cost, [rival.cost for rival in best.rivals]) == (10, [12.0])
+    assert (best.cost, [alternative.cost for alternative in best.alternatives]) == (10, [12.0])
     points = ORGAN.vertices_mm[:5]
     wider = best.motion.covariance_mm2(points) - motion.covariance_mm2(points)
     np.testing.assert_allclose(wider, np.tile(np.diag([0, 36 * share, 0]), (5, 1, 1)), atol=1e-6)
 
 
-def test_neither_the_same_minimum_nor_an_unlikely_one_is_a_rival():
+def test_neither_the_same_minimum_nor_an_unlikely_one_is_a_alternative():
     motion = replace(MOTION, covariance=0.01 * np.eye(26))
     same, away = (replace(motion, centre_mm=motion.centre_mm + [0, mm, 0]) for mm in (0.1, 6.0))
-    assert best_of(fit_of(motion, 10.0), fit_of(same, 10.5)).rivals == ()
-    assert best_of(fit_of(motion, 10.0), fit_of(away, 10.1 + RIVAL_COST)).rivals == ()
+    assert best_of(fit_of(motion, 10.0), fit_of(same, 10.5)).alternatives == ()
+    assert best_of(fit_of(motion, 10.0), fit_of(away, 10.1 + RIVAL_COST)).alternatives == ()
     first = best_of(fit_of(motion, 10.0), fit_of(away, 11.0))
-    assert len(best_of(first, fit_of(away, 11.5)).rivals) == 1  # the same one again
+    assert len(best_of(first, fit_of(away, 11.5)).alternatives) == 1  # the same one again
     turned = best_of(first, fit_of(away, 9.0))  # one of them won after all
-    assert [rival.cost for rival in turned.rivals] == [10.0]
+    assert [alternative.cost for alternative in turned.alternatives] == [10.0]

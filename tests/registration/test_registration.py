@@ -16,8 +16,8 @@ from tumortrack.core.estimate import Motion
 from tumortrack.core.types import Mesh
 from tumortrack.organ.rest_shape import RestShape, distance_of
 from tumortrack.registration.config import GaussNewtonConfig
-from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.multi_view import MultiViewCloud
 from tumortrack.registration.search import turned_starts
 from warp_objects import (
     ANATOMY,
@@ -48,7 +48,7 @@ def surface(motion, count, seed=0):
     """Points of the deformed surface, from all sides, camera frame."""
     rng = np.random.default_rng(seed)
     vertices = ORGAN.vertices_mm[rng.permutation(len(ORGAN.vertices_mm))[:count]]
-    return motion.carry(vertices)
+    return motion.forward(vertices)
 
 
 START = nudged(placed(), [4.0, -3, 5], [0.1, -0.08, 0.12])
@@ -98,17 +98,19 @@ def test_the_way_there_and_back_is_none():
     motion = placed()
     assert isinstance(motion, Motion)
     points = CENTER + 1.5 * (inside(500) - CENTER)
-    there = motion.carry(points)
+    there = motion.forward(points)
     rigid = (points - shape().body.center_ct) @ TURNED.T + PLACE_MM
     assert np.linalg.norm(there - rigid, axis=1).max() > 2  # it deforms
-    np.testing.assert_allclose(motion.back(there), points, atol=0.02)
+    np.testing.assert_allclose(motion.inverse(there), points, atol=0.02)
     undeformed = placed(share=0.0)
-    np.testing.assert_allclose(undeformed.carry(points), rigid, atol=1e-3)
+    np.testing.assert_allclose(undeformed.forward(points), rigid, atol=1e-3)
     homogeneous = np.column_stack([points, np.ones(len(points))])
     np.testing.assert_allclose((homogeneous @ motion.camera_from_ct.T)[:, :3], rigid, atol=1e-9)
 
 
-@pytest.mark.parametrize("way", ["carry", "back", "covariance_mm2", "std_mm", "largest_std_mm"])
+@pytest.mark.parametrize(
+    "way", ["forward", "inverse", "covariance_mm2", "std_mm", "largest_std_mm"]
+)
 def test_what_is_no_list_of_finite_points_is_refused(way, unchecked):
     """NaN ended the process, and other shapes were read beyond their end."""
     motion, points = dataclasses.replace(placed(), covariance=np.eye(6 + SMALL.modes)), inside(5)
@@ -133,7 +135,7 @@ def test_more_points_make_surer_and_a_seen_side_is_surer_than_a_hidden_one():
     assert np.all(more < few)
     vertices = ORGAN.vertices_mm
     one_end = vertices[vertices[:, 2] > CENTER[2] + 10][::4]
-    spread = refined(placed().carry(one_end), START).motion
+    spread = refined(placed().forward(one_end), START).motion
     ends = CENTER + np.array([[0, 0, 40.0], [0, 0, -40.0]])
     seen, hidden = spread.std_mm(ends)
     assert hidden > 1.5 * seen
@@ -170,13 +172,13 @@ def test_a_known_pose_and_state_are_found_again():
     seen, unseen = points[:1200], points[1200:]
     fit = refined(seen, START)
     target = inside(200)
-    before = np.linalg.norm(START.carry(target) - truth.carry(target), axis=1)
-    after = np.linalg.norm(fit.motion.carry(target) - truth.carry(target), axis=1)
+    before = np.linalg.norm(START.forward(target) - truth.forward(target), axis=1)
+    after = np.linalg.norm(fit.motion.forward(target) - truth.forward(target), axis=1)
     assert before.mean() > 5
     assert after.mean() < 0.8  # an ellipsoid may also be sheared along itself
     distances = shape().distances[0]
     for motion, least, most in ((START, 2, np.inf), (fit.motion, 0, 0.15)):
-        off, _ = with_slope(distances, motion.back(unseen).astype(np.float32))
+        off, _ = with_slope(distances, motion.inverse(unseen).astype(np.float32))
         assert least < np.abs(off).mean() < most
     assert np.abs(fit.motion.coefficients - shape().body.mean).max() > 1
     exact = refined(surface(placed(), 1200), placed())
@@ -188,12 +190,12 @@ def test_a_fifth_of_strays_does_not_matter():
     points = surface(truth, 1000)
     clean = refined(points, START)
     spoiled = points.copy()
-    strays = np.random.default_rng(6).permutation(1000)[:200]
-    spoiled[strays] = PLACE_MM + np.random.default_rng(7).uniform(-80, 80, (200, 3))
+    outliers = np.random.default_rng(6).permutation(1000)[:200]
+    spoiled[outliers] = PLACE_MM + np.random.default_rng(7).uniform(-80, 80, (200, 3))
     fit = refined(spoiled, START)
-    apart = fit.motion.carry(target) - clean.motion.carry(target)
+    apart = fit.motion.forward(target) - clean.motion.forward(target)
     assert np.linalg.norm(apart, axis=1).mean() < 0.4
-    assert np.abs(fit.distances_mm[strays]).mean() > 10
+    assert np.abs(fit.distances_mm[outliers]).mean() > 10
 
 
 @pytest.mark.parametrize("times", [0.93, 1.0, 1.07])
@@ -202,7 +204,7 @@ def test_a_wrong_scale_of_the_camera_shows_in_the_fit(times):
     points = times * surface(placed(), 1000)
     start = dataclasses.replace(START, centre_mm=times * START.centre_mm)
     fit = refined(points, start, config)
-    size = fit.looks.apparent_size(fit.motion, config)
+    size = fit.views.apparent_size(fit.motion, config)
     # The robust kernel reads too little.
     assert abs(size.times - times) < 0.6 * abs(times - 1) + 0.01
     assert (size.gain > 9.2) == (times != 1)
@@ -214,7 +216,7 @@ def test_the_best_of_several_starts_wins_wherever_it_stands():
     steady = GaussNewtonConfig(steps=40, first_mm=3.0, last_mm=3.0)
     alone, far = refined(points, START, steady), nudged(placed(), [0, 0, 60], [0, 0, 0])
     for starts in ([START, far], [far, START]):
-        best = method(steady).best_fit(Looks.of([points]), starts)
+        best = method(steady).best_fit(MultiViewCloud.from_points([points]), starts)
         # A little less where a start beside it ends nearer to the minimum.
         assert 0.97 * alone.cost < best.cost <= alone.cost
 
@@ -222,7 +224,7 @@ def test_the_best_of_several_starts_wins_wherever_it_stands():
 def test_starts_beside_a_fit_are_as_unlikely_as_was_asked_and_lead_back_to_it():
     points = surface(placed(), 500)
     fit = refined(points, START)
-    starts = turned_starts(fit.motion, fit.moved)
+    starts = turned_starts(fit.motion, fit.pose_offset)
     precision = np.linalg.inv(fit.motion.covariance)
     turns = []
     for start, moved in starts:
@@ -230,7 +232,7 @@ def test_starts_beside_a_fit_are_as_unlikely_as_was_asked_and_lead_back_to_it():
         shift = fit.motion.rotation.T @ (start.centre_mm - fit.motion.centre_mm)
         off = np.concatenate([shift, turn, start.coefficients - fit.motion.coefficients])
         assert np.sqrt(off @ precision @ off) == pytest.approx(4.5)
-        np.testing.assert_allclose(moved - fit.moved, off[:6], atol=1e-9)
+        np.testing.assert_allclose(moved - fit.pose_offset, off[:6], atol=1e-9)
         turns.append(turn)
         again = descent(points, start, GaussNewtonConfig(), moved)
         again.run(20)

@@ -45,8 +45,8 @@ def test_points_inside_are_found_within_millimetres_wherever_the_camera_stands(
     errors, rigid_errors = [], []
     for stage in stages:
         motion = tracker.locate(stage.cloud, grid=16).motion
-        truth = stage.carry(targets)
-        errors.append(np.linalg.norm(motion.carry(targets) - truth, axis=1).mean())
+        truth = stage.forward(targets)
+        errors.append(np.linalg.norm(motion.forward(targets) - truth, axis=1).mean())
         middle = truth - truth.mean(0) + stage.cloud.points_mm.mean(0)
         rigid_errors.append(np.linalg.norm(middle - truth, axis=1).mean())
     assert np.median(rigid_errors) > 15  # the cloud's middle is no answer
@@ -54,14 +54,14 @@ def test_points_inside_are_found_within_millimetres_wherever_the_camera_stands(
     turn = Rotation.from_euler("z", 70, degrees=True).as_matrix()
     away = stages[0].cloud.points_mm @ turn.T + [5, -8, 60]
     moved = tracker.locate(SensorCloud(away.astype(np.float32)), grid=16, seed=3)
-    expected = estimate.motion.carry(targets) @ turn.T + [5, -8, 60]
-    assert np.linalg.norm(moved.motion.carry(targets) - expected, axis=1).mean() < 0.5
+    expected = estimate.motion.forward(targets) @ turn.T + [5, -8, 60]
+    assert np.linalg.norm(moved.motion.forward(targets) - expected, axis=1).mean() < 0.5
 
 
 def test_an_estimate_answers_in_arrays(tracker, stages, estimate):
     points_ct = ANATOMY.organ.vertices_mm
     moved = estimate.forward(points_ct)
-    np.testing.assert_array_equal(moved, estimate.motion.carry(points_ct))
+    np.testing.assert_array_equal(moved, estimate.motion.forward(points_ct))
     np.testing.assert_allclose(estimate.inverse(moved), points_ct, atol=0.05)
     rest_mm = transform_points(estimate.camera_from_ct, points_ct)
     best = np.linalg.norm(rest_mm - moved, axis=1)
@@ -125,10 +125,10 @@ def test_meshes_are_the_cts_carried_along(estimate):
     assert isinstance(estimate.motion, Motion)
     for name, part in zip(ANATOMY.names, ANATOMY.parts, strict=True):
         mesh = estimate.meshes[name]
-        np.testing.assert_array_equal(mesh.vertices_mm, estimate.motion.carry(part.vertices_mm))
+        np.testing.assert_array_equal(mesh.vertices_mm, estimate.motion.forward(part.vertices_mm))
         np.testing.assert_array_equal(mesh.faces, part.faces)
         np.testing.assert_allclose(
-            estimate.motion.back(mesh.vertices_mm), part.vertices_mm, atol=0.05
+            estimate.motion.inverse(mesh.vertices_mm), part.vertices_mm, atol=0.05
         )
         told = estimate.report.parts[name]
         assert told.volume_ml == pytest.approx(part.volume_mm3 / 1000, rel=0.15)
@@ -162,7 +162,7 @@ def test_labels_of_points_and_voxels_agree_with_the_meshes(estimate):
     probability = cloud.probability  # higher away from surfaces
     assert probability.min() >= 0.5
     assert probability.max() <= 1
-    points_ct = estimate.motion.back(estimate.cloud.points_mm).astype(np.float32)
+    points_ct = estimate.motion.inverse(estimate.cloud.points_mm).astype(np.float32)
     _, margin_mm = shape().labels_at(points_ct)
     near, deep = (probability[side].mean() for side in (margin_mm < 0.5, margin_mm > 6))
     assert deep > near + 0.1
@@ -218,11 +218,11 @@ def test_the_command_says_where_points_of_the_ct_are(slim_model, stages, estimat
     rows = list(csv.DictReader((out / "points.csv").open()))
     assert [row["name"] for row in rows] == ["p0", "p1", "p2"]
     places = np.array([[float(row[f"camera_{axis}"]) for axis in "xyz"] for row in rows])
-    np.testing.assert_allclose(places, estimate.motion.carry(points), atol=0.02)
+    np.testing.assert_allclose(places, estimate.motion.forward(points), atol=0.02)
     unsure = [float(row["std_mm"]) for row in rows]
     np.testing.assert_allclose(unsure, estimate.motion.std_mm(points), rtol=0.02)
     assert min(unsure) > 0
-    truth = stages[0].carry(points)
+    truth = stages[0].forward(points)
     assert np.linalg.norm(places - truth, axis=1).mean() < 6
     report = json.loads((out / "report.json").read_text())
     assert report["map"]["points"] == 3
@@ -241,7 +241,7 @@ def test_clouds_of_an_organ_as_never_seen_are_answered(tracker, stages):
         found = tracker.locate(SensorCloud(points.astype(np.float32)), grid=16)
         assert all(part.found for part in found.report.parts.values())
     certain, part = (  # an ellipsoid fits the other way round too
-        replace(tracker.locate(SensorCloud(points), grid=16).motion, rivals=())
+        replace(tracker.locate(SensorCloud(points), grid=16).motion, alternatives=())
         for points in (cloud, half)
     )
     vertices = ANATOMY.organ.vertices_mm

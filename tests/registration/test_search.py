@@ -17,9 +17,9 @@ from tumortrack.core.types import Anatomy, SensorCloud
 from tumortrack.io.case import load_case
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.in_distribution import RIVAL_COST
-from tumortrack.registration.looks import Looks
+from tumortrack.registration.multi_view import MultiViewCloud
 from tumortrack.registration.registration import Registration
-from tumortrack.registration.search import APART_MM, PosePrior, Search, apart_mm
+from tumortrack.registration.search import APART_MM, PosePrior, Search, distance_mm
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.tracker import Tracker
 from warp_objects import ANATOMY, TURNED, placed, shape, shape_of, with_slope
@@ -43,7 +43,7 @@ def over(motion):
 
 def tumors_off_mm(motion, truth):
     vertices = np.concatenate([one.vertices_mm for one in truth.shape.anatomy_ct.tumors])
-    return np.linalg.norm(motion.carry(vertices) - truth.carry(vertices), axis=1).mean()
+    return np.linalg.norm(motion.forward(vertices) - truth.forward(vertices), axis=1).mean()
 
 
 # --- the kernel ---
@@ -74,7 +74,7 @@ def plainly_descended(points, widths_mm, rotation, centre):
 
 
 def test_a_descent_is_that_of_plain_arithmetic():
-    points = placed(share=0.0).carry(ANATOMY.organ.vertices_mm[::25]).astype(np.float32)
+    points = placed(share=0.0).forward(ANATOMY.organ.vertices_mm[::25]).astype(np.float32)
     widths_mm = np.array([10.0, 6.0, 3.0])
     turns = Rotation.from_rotvec([[0.1, -0.2, 0.1], [0.0, 0.0, 1.5], [0.8, 0.3, -0.4]]).as_matrix()
     rotations = np.ascontiguousarray(TURNED @ turns)
@@ -106,7 +106,7 @@ def test_what_is_allowed_costs_nothing_and_what_is_not_the_more_the_farther():
     turned = Rotation.from_euler("z", 77, degrees=True).as_matrix() @ rotations
     np.testing.assert_allclose(LIMITED.cost(turned), costs, atol=1e-9)  # about the line of sight
     assert (ANYHOW.cost(Rotation.random(50, random_state=0).as_matrix()) == 0).all()
-    either = replace(LIMITED, either_side=True)
+    either = replace(LIMITED, allow_flip=True)
     np.testing.assert_allclose(either.cost(OVER.as_matrix() @ rotations), either.cost(rotations))
     np.testing.assert_allclose(either.cost(rotations), LIMITED.cost(rotations) * (tilts <= 90))
 
@@ -123,26 +123,26 @@ def test_what_is_allowed_costs_nothing_and_what_is_not_the_more_the_farther():
 )
 def test_a_pose_is_found_from_nothing(rest, turn_degrees, tilt_degrees, hidden):
     truth = lying(rest, turn_degrees, tilt_degrees)
-    looks, search = Looks.of([seen(truth, hidden)]), Search(rest, LIMITED)
-    first, *others = starts = search.starts(looks)
-    for start, again in zip(starts, search.starts(looks), strict=True):
+    views, search = MultiViewCloud.from_points([seen(truth, hidden)]), Search(rest, LIMITED)
+    first, *others = starts = search.starts(views)
+    for start, again in zip(starts, search.starts(views), strict=True):
         np.testing.assert_array_equal(start.rotation, again.rotation)
         np.testing.assert_array_equal(start.centre_mm, again.centre_mm)
-    assert apart_mm(first, truth) < 2.5
-    assert min(apart_mm(one, first) for one in others) > APART_MM
+    assert distance_mm(first, truth) < 2.5
+    assert min(distance_mm(one, first) for one in others) > APART_MM
     assert LIMITED.excludes(starts[-1].rotation)  # the other side up was tried
-    fit = Registration(rest, GaussNewtonConfig(), LIMITED).register(looks)
+    fit = Registration(rest, GaussNewtonConfig(), LIMITED).register(views)
     assert tumors_off_mm(fit.motion, truth) < 0.7
-    assert fit.beyond is None
+    assert fit.excluded_pose is None
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_any_rotation_is_found_where_all_are_allowed(rest, seed):
-    anyhow = Rotation.random(random_state=seed).as_matrix()
-    truth = replace(lying(rest, 0), rotation=anyhow)
-    looks = Looks.of([seen(truth)])
-    assert apart_mm(Search(rest, ANYHOW).starts(looks)[0], truth) < 2.5
-    fit = Registration(rest, GaussNewtonConfig(), ANYHOW).register(looks)
+    unconstrained = Rotation.random(random_state=seed).as_matrix()
+    truth = replace(lying(rest, 0), rotation=unconstrained)
+    views = MultiViewCloud.from_points([seen(truth)])
+    assert distance_mm(Search(rest, ANYHOW).starts(views)[0], truth) < 2.5
+    fit = Registration(rest, GaussNewtonConfig(), ANYHOW).register(views)
     assert tumors_off_mm(fit.motion, truth) < 0.7
 
 
@@ -153,9 +153,9 @@ def test_several_looks_are_searched_as_one(rest, degrees):
         turn = Rotation.from_euler("y", angle, degrees=True).as_matrix()
         poses.append(rigid(turn, PLACE_MM - turn @ PLACE_MM))
     clouds = [seen(truth, 0.4), *(seen(truth, 0.0, pose) for pose in poses)]
-    looks = Looks.of(clouds, poses)
-    assert apart_mm(Search(rest, LIMITED).starts(looks)[0], truth) < 2.5
-    fit = Registration(rest, GaussNewtonConfig(), LIMITED).register(looks)
+    views = MultiViewCloud.from_points(clouds, poses)
+    assert distance_mm(Search(rest, LIMITED).starts(views)[0], truth) < 2.5
+    fit = Registration(rest, GaussNewtonConfig(), LIMITED).register(views)
     assert tumors_off_mm(fit.motion, truth) < 0.7
 
 
@@ -163,8 +163,8 @@ def test_several_looks_are_searched_as_one(rest, degrees):
 
 
 @pytest.fixture(scope="module")
-def model(clinic_model):
-    return load_model(clinic_model)
+def model(elastic_model):
+    return load_model(elastic_model)
 
 
 @pytest.mark.parametrize("turn_degrees", [0, 100, 200])
@@ -175,33 +175,33 @@ def test_an_organ_that_lies_upside_down_is_told_and_found_where_that_is_allowed(
     cloud = SensorCloud(seen(truth))
     tracker = Tracker(model)
     found = tracker.locate(cloud, grid=16)
-    beyond = found.report.fit_cost.beyond
-    assert beyond.less > RIVAL_COST
-    assert beyond.tilt_degrees == pytest.approx(180, abs=3)
+    excluded_pose = found.report.fit_cost.excluded_pose
+    assert excluded_pose.less > RIVAL_COST
+    assert excluded_pose.tilt_degrees == pytest.approx(180, abs=3)
     assert found.quality == "poor"
     assert tumors_off_mm(found.motion, truth) > 20
     assert tracker.locate(SensorCloud(seen(over(truth))), grid=16).quality == "good"
     scene = model.config.scene
     pose = msgspec.structs.replace(scene.pose, rotations="full")
     scene = msgspec.structs.replace(scene, pose=pose)
-    anyhow = replace(model, config=msgspec.structs.replace(model.config, scene=scene))
+    unconstrained = replace(model, config=msgspec.structs.replace(model.config, scene=scene))
     for right in (
-        Tracker(anyhow).locate(cloud, grid=16),
-        tracker.follow(cloud, how=FollowOptions(either_side=True)),  # it was seen a moment ago
+        Tracker(unconstrained).locate(cloud, grid=16),
+        tracker.follow(cloud, how=FollowOptions(allow_flip=True)),  # it was seen a moment ago
     ):
-        assert right.report.fit_cost.beyond is None
+        assert right.report.fit_cost.excluded_pose is None
         assert right.quality == "good"
         assert tumors_off_mm(right.motion, truth) < 1.5
 
 
 def test_an_organ_nearly_the_same_from_below_may_lie_upside_down(slim_model):
-    """A bent ellipsoid: the wrong side fits as well as usual, and the other one better."""
+    """A compliant ellipsoid: the wrong side fits as well as usual, and the other one better."""
 
-    def bent(mesh):
+    def compliant(mesh):
         bend_mm = 2 * ((mesh.vertices_mm[:, 2] - CENTER[2]) / RADII[2]) ** 2
-        return mesh.moved(mesh.vertices_mm + np.outer(bend_mm, [0.0, 1.0, 0.0]))
+        return mesh.with_vertices(mesh.vertices_mm + np.outer(bend_mm, [0.0, 1.0, 0.0]))
 
-    banana = Anatomy(tuple(bent(part) for part in ANATOMY.parts))
+    banana = Anatomy(tuple(compliant(part) for part in ANATOMY.parts))
     known = load_model(slim_model)
     trained = {**known.provenance, "validation_far": 0.0}
     noisy = msgspec.structs.replace(known.calibration, usual_cost=20.0)  # its scenes have no noise
@@ -213,6 +213,6 @@ def test_an_organ_nearly_the_same_from_below_may_lie_upside_down(slim_model):
     )
     cost = found.report.fit_cost
     assert cost.now < cost.usual
-    assert cost.beyond.less > 0
+    assert cost.excluded_pose.less > 0
     assert (found.quality, found.finding.kind) == ("poor", "upside_down")
-    assert right.report.fit_cost.beyond is None
+    assert right.report.fit_cost.excluded_pose is None

@@ -40,7 +40,7 @@ def lumpy(seed, radius_mm=15.0):
     rng = np.random.default_rng(seed)
     smooth = sphere(radius_mm)
     waves, bumps = rng.normal(0, 0.12, (3, 3)), rng.normal(0, 1.2, (3, 3))
-    return smooth.moved(smooth.vertices_mm + np.sin(smooth.vertices_mm @ waves) @ bumps)
+    return smooth.with_vertices(smooth.vertices_mm + np.sin(smooth.vertices_mm @ waves) @ bumps)
 
 
 def grid(low_mm, step_mm):
@@ -82,7 +82,7 @@ def test_distances_obey_their_laws(seed):
     assert there.surface_mm < there.hausdorff_95_mm <= there.hausdorff_mm
     assert surface_distances(a, a, 2.0).hausdorff_mm < 1e-6
     turn = trimesh.transformations.rotation_matrix(1.0, (1, 2, 3))[:3, :3]
-    turned = [m.moved(m.vertices_mm @ turn.T + 100) for m in (a, b)]
+    turned = [m.with_vertices(m.vertices_mm @ turn.T + 100) for m in (a, b)]
     assert surface_distances(*turned, 2.0).hausdorff_mm == pytest.approx(there.hausdorff_mm)
 
 

@@ -143,7 +143,7 @@ def test_slice_and_outline_of_coarse_voxels_belong_together():
     hull = trimesh.convex.convex_hull(corners)
     mesh, between_mm = Mesh(hull.vertices, hull.faces), step * np.array([15.0, 15.0, 15.5])
 
-    def apart_mm(through_mm):
+    def distance_mm(through_mm):
         plane = SlicePlane(through_mm, *np.array(PLANES["axial"]), 90.0)
         places = plane.points(360)
         inside = sampled(bar, lps_from_index, places) == 1
@@ -152,8 +152,8 @@ def test_slice_and_outline_of_coarse_voxels_belong_together():
 
     through_mm = in_voxels(between_mm, lps_from_index)
     assert np.abs(through_mm - between_mm).max() == pytest.approx(step / 2)
-    assert apart_mm(between_mm) == pytest.approx(step / 2, abs=0.3)
-    assert apart_mm(through_mm) < 0.3
+    assert distance_mm(between_mm) == pytest.approx(step / 2, abs=0.3)
+    assert distance_mm(through_mm) < 0.3
     turned = trimesh.transformations.rotation_matrix(0.4, (1, 2, 3)) @ lps_from_index
     index = np.linalg.inv(turned) @ [*in_voxels(np.array([20.0, 31.0, 7.0]), turned), 1.0]
     np.testing.assert_allclose(index, np.rint(index), atol=1e-9)

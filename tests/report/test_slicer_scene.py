@@ -61,10 +61,10 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 class Shift:
     """10 mm along x; how surely is unknown."""
 
-    def carry(self, points):
+    def forward(self, points):
         return points + [10.0, 0, 0]
 
-    def back(self, points):
+    def inverse(self, points):
         return points - [10.0, 0, 0]
 
     def std_mm(self, points):

@@ -53,8 +53,8 @@ def test_edges_instruments_and_strays_do_not_count():
     depth = frame.depth_mm.copy()
     rng = np.random.default_rng(1)
     depth[150:170] = 90.0 + 0.5 * rng.standard_normal((20, 848))  # a shaft
-    strays = rng.random(depth.shape) < 2e-4
-    depth[strays] += rng.uniform(-20, 20, strays.sum())
+    outliers = rng.random(depth.shape) < 2e-4
+    depth[outliers] += rng.uniform(-20, 20, outliers.sum())
     assert image_noise(frame.with_depth(depth)).white_mm == pytest.approx(0.5, rel=0.2)
 
 

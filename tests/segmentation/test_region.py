@@ -23,7 +23,7 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.core.units import Unit
 from tumortrack.segmentation import Hints, RegionConfig, organ_points
-from tumortrack_lab.world.kidneys import random_anatomy
+from tumortrack_benchmarks.physics.kidneys import random_anatomy
 
 WIDE = CloudConfig(near_mm=60.0, far_mm=400.0)
 EVERY = CloudConfig(near_mm=60.0, far_mm=400.0, n_points=10**6)
@@ -116,8 +116,8 @@ def test_table_and_what_is_behind_it_goes_the_organ_stays():
     organ = r2 < 1
     depth = np.where(organ, 165 - 30 * np.sqrt(np.clip(1 - r2, 0, 1)), depth)
     region = points(DepthFrame(depth, SMALL))
-    assert not (region.taken == 0)[~organ].any()
-    assert (region.taken == 0)[organ].mean() > 0.95
+    assert not (region.pixel_class == 0)[~organ].any()
+    assert (region.pixel_class == 0)[organ].mean() > 0.95
     assert region.counts["plane"] > 0.95 * (~organ).sum()
 
 
@@ -179,7 +179,7 @@ def test_two_bodies_stay_two_behind_an_occluder():
         depth = np.where(r2 < 1, 150 - 25 * np.sqrt(np.clip(1 - r2, 0, 1)), depth)
     band = np.abs(u - SMALL.cx - 9) < 13
     frame = DepthFrame(np.where(band, 100.0, depth), SMALL)
-    found = points(frame, RegionConfig(crop=EVERY)).taken == 0
+    found = points(frame, RegionConfig(crop=EVERY)).pixel_class == 0
     left = np.isfinite(depth) & ~band & (u < 215)
     assert found[left].mean() > 0.95
     assert not found[~left].any()
@@ -194,7 +194,7 @@ def test_what_lies_on_both_sides_of_an_organ_is_not_one():
     depth = np.where(bed, 150 + 0.05 * np.abs(u - 212), np.nan)
     depth = np.where(organ, 135 - 20 * np.sqrt(np.clip(1 - r2, 0, 1)), depth)
     assert np.count_nonzero(bed) > np.count_nonzero(organ)
-    found = points(DepthFrame(depth, SMALL), RegionConfig(crop=EVERY, plane=False)).taken == 0
+    found = points(DepthFrame(depth, SMALL), RegionConfig(crop=EVERY, plane=False)).pixel_class == 0
     assert found[organ].mean() > 0.95
     assert not found[bed].any()
 
@@ -206,8 +206,8 @@ def test_stray_points_go():
     stray = np.isnan(depth) & (rng.random(depth.shape) < 0.03)
     depth[stray] = rng.uniform(100, 160, stray.sum())
     region = points(DepthFrame(depth, SMALL))
-    assert not (region.taken == 0)[stray].mean() > 0.02
-    assert (region.taken == 0)[np.isfinite(frame.depth_mm)].mean() > 0.97
+    assert not (region.pixel_class == 0)[stray].mean() > 0.02
+    assert (region.pixel_class == 0)[np.isfinite(frame.depth_mm)].mean() > 0.97
 
 
 @pytest.mark.slow
@@ -277,7 +277,7 @@ def measured(organs, props, seeds):
     for seed in seeds:
         scene = make_scene(organs[seed % len(organs)], props, np.random.default_rng((31, seed)))
         region = points(scene.frame)
-        rows.append(precision_recall(scene, region.taken))
+        rows.append(precision_recall(scene, region.pixel_class))
     return np.array(rows)
 
 
@@ -323,8 +323,8 @@ def test_what_else_may_be_the_organ_comes_with_it():
     assert np.median(column_of(region.cloud)) < 220 < np.median(column_of(other))
     assert points(two_domes(), picked_mm=region.cloud.points_mm[0]).cloud.others == ()
     places = deproject(two_domes())[::-1]
-    strays = np.array([[0.0, 0.0, 100.0], [190.0, 0.0, 300.0]])
-    whole = SensorCloud(np.concatenate([strays, places]).astype(np.float32))
+    outliers = np.array([[0.0, 0.0, 100.0], [190.0, 0.0, 300.0]])
+    whole = SensorCloud(np.concatenate([outliers, places]).astype(np.float32))
     cloud = points(whole).cloud
     (other,) = cloud.others
     sides = [set((column_of(each) > 225).tolist()) for each in (cloud, other)]

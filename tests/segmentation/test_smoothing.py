@@ -71,12 +71,12 @@ def test_scattered_points_are_dropped_and_the_surface_stays(share):
     rng = np.random.default_rng(1)
     points = points_of(seen(424, 150), 2500)
     low, high = points.min(0), points.max(0)
-    strays = int(share * len(points))
-    points[:strays] = (low + high) / 2 + (rng.random((strays, 3)) - 0.5) * 1.5 * (high - low)
+    outliers = int(share * len(points))
+    points[:outliers] = (low + high) / 2 + (rng.random((outliers, 3)) - 0.5) * 1.5 * (high - low)
     found = clean_cloud(SensorCloud(points.astype(np.float32)))
     far = np.abs(off_mm(points)) > 3
     assert (np.abs(off_mm(found.points_mm)) > 3).sum() < 0.1 * far.sum()
-    assert len(found.points_mm) > min(0.75 * (len(points) - strays), 999)  # or smoothed ones
+    assert len(found.points_mm) > min(0.75 * (len(points) - outliers), 999)  # or smoothed ones
 
 
 def test_a_sparse_cloud_keeps_its_points_and_says_its_noise():

@@ -18,8 +18,8 @@ from tumortrack.core.cloud import CloudConfig
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.segmentation import Hints, RegionConfig, organ_points
-from tumortrack.segmentation.tissue import sample_click, teach
-from tumortrack_lab.world.kidneys import random_anatomy
+from tumortrack.segmentation.tissue import sample_click, train_tissue_classifier
+from tumortrack_benchmarks.physics.kidneys import random_anatomy
 
 CONFIG = RegionConfig(crop=CloudConfig(near_mm=60.0, far_mm=400.0))
 RED, YELLOW, GREEN = (168, 82, 70), (222, 188, 112), (62, 108, 102)
@@ -45,7 +45,7 @@ def clicks_of(frame, picture, on=ON, beside=BESIDE):
 
 
 def find(frame, picture, taught):
-    hints = Hints(picture=picture, taught=taught)
+    hints = Hints(picture=picture, tissue_classifier=taught)
     return organ_points(frame, CONFIG, hints, np.random.default_rng(0))
 
 
@@ -53,20 +53,20 @@ def test_colour_parts_what_is_one_thing_to_depth():
     frame, picture, on = two_tissues()
     u, _ = pixels(SMALL)
     alone = organ_points(frame, CONFIG, Hints(), np.random.default_rng(0))
-    assert (alone.taken == 0)[on].mean() > 0.9
-    taught = teach(clicks_of(frame, picture))
+    assert (alone.pixel_class == 0)[on].mean() > 0.9
+    taught = train_tissue_classifier(clicks_of(frame, picture))
     assert taught.right == 1
     region = find(frame, picture, taught)
-    organ = region.taken == 0
+    organ = region.pixel_class == 0
     assert region.doubt == ""
     assert organ[on & (u < 205)].mean() > 0.95
     assert organ[on & (u > 219)].mean() < 0.01
     assert region.counts["colour"] > 0.9 * (on & (u > 212)).sum()
     assert sum(region.counts.values()) == organ.size
     # Python's way, and of a picture twice as large: every second pixel is looked at.
-    same = tt.teach(frame, picture, ON, BESIDE)
+    same = tt.train_tissue_classifier(frame, picture, ON, BESIDE)
     assert np.array_equal(same.centres, taught.centres)
-    cloud = tt.find_organ(frame, range_mm=(60, 400), picture=picture, taught=same)
+    cloud = tt.find_organ(frame, range_mm=(60, 400), picture=picture, tissue_classifier=same)
     assert cloud.points_mm[:, 0].max() < 2
 
 
@@ -75,20 +75,23 @@ def test_the_order_of_clicks_changes_nothing():
     clicks = clicks_of(frame, picture)
     first, second = (
         find(frame, picture, taught)
-        for taught in (teach(clicks), teach([clicks[k] for k in (5, 0, 3, 6, 1, 4, 2)]))
+        for taught in (
+            train_tissue_classifier(clicks),
+            train_tissue_classifier([clicks[k] for k in (5, 0, 3, 6, 1, 4, 2)]),
+        )
     )
-    assert np.array_equal(first.taken, second.taken)
+    assert np.array_equal(first.pixel_class, second.pixel_class)
     assert np.array_equal(first.cloud.points_mm, second.cloud.points_mm)
 
 
 def test_exposure_and_shading_change_hardly_a_pixel():
     frame, picture, on = two_tissues()
-    taught = teach(clicks_of(frame, picture))
-    as_taught = find(frame, picture, taught).taken == 0
+    taught = train_tissue_classifier(clicks_of(frame, picture))
+    as_taught = find(frame, picture, taught).pixel_class == 0
     shades = (0.5, 0.75, 1.15, np.linspace(0.6, 1.1, SMALL.width)[:, None])
     for shade in shades:
         other = np.clip(picture * shade, 0, 255).astype(np.uint8)
-        changed = (find(frame, other, taught).taken == 0) != as_taught
+        changed = (find(frame, other, taught).pixel_class == 0) != as_taught
         assert changed.sum() < 0.02 * on.sum()
 
 
@@ -99,7 +102,7 @@ def test_clicks_that_do_not_tell_are_refused():
     mixed = [replace(click, organ=k % 2 == 0) for k, click in enumerate(clicks)]
     for wrong in (clicks[:3], clicks[:1], clicks_of(frame, same), mixed):
         with pytest.raises(InputError):
-            teach(wrong)
+            train_tissue_classifier(wrong)
     depth_mm = frame.depth_mm.copy()
     depth_mm[:20, :20] = np.nan
     holed = DepthFrame(depth_mm, SMALL)
@@ -111,7 +114,7 @@ def test_clicks_that_do_not_tell_are_refused():
 
 def test_where_it_cannot_be_used_depth_decides_and_it_is_said():
     frame, picture, _ = two_tissues()
-    taught = teach(clicks_of(frame, picture))
+    taught = train_tissue_classifier(clicks_of(frame, picture))
     alone = organ_points(frame, CONFIG, Hints(), np.random.default_rng(0))
     blue, dark = (
         np.clip(picture * gain, 0, 255).astype(np.uint8) for gain in ([0.3, 0.7, 2], 0.02)
@@ -120,21 +123,21 @@ def test_where_it_cannot_be_used_depth_decides_and_it_is_said():
     for other in (None, blue, dark, grey):
         region = find(frame, other, taught)
         assert region.doubt
-        assert np.array_equal(region.taken, alone.taken)
+        assert np.array_equal(region.pixel_class, alone.pixel_class)
     assert find(SensorCloud(deproject(frame)), picture, taught).doubt
     with pytest.raises(NoEstimate):
-        tt.find_organ(frame, range_mm=(60, 400), picture=blue, taught=taught)
+        tt.find_organ(frame, range_mm=(60, 400), picture=blue, tissue_classifier=taught)
 
 
 def test_grey_pictures_teach_only_large_differences():
     frame, picture, on = two_tissues()
     grey = picture.mean(-1).astype(np.uint8)
     with pytest.raises(InputError):
-        teach(clicks_of(frame, grey))
+        train_tissue_classifier(clicks_of(frame, grey))
     u, _ = pixels(SMALL)
     grey[~on | (u > 212)] = 14 + grey[~on | (u > 212)] // 20
-    taught = teach(clicks_of(frame, grey))
-    organ = find(frame, grey, taught).taken == 0
+    taught = train_tissue_classifier(clicks_of(frame, grey))
+    organ = find(frame, grey, taught).pixel_class == 0
     assert organ[on & (u < 205)].mean() > 0.9
     assert organ[on & (u > 219)].mean() < 0.05
 
@@ -186,8 +189,8 @@ def test_what_clicks_gain_in_scenes(kind, kidneys):
         scene, picture, clicks = scene_with_colours(kidneys, props, seed)
         regions = [organ_points(scene.frame, CONFIG, Hints(), np.random.default_rng(0))] * 2
         with suppress(InputError):  # of clicks that look alike
-            regions[1] = find(scene.frame, picture, teach(clicks))
-        rows.append([precision_recall(scene, region.taken) for region in regions])
+            regions[1] = find(scene.frame, picture, train_tissue_classifier(clicks))
+        rows.append([precision_recall(scene, region.pixel_class) for region in regions])
     (before, after), means = np.swapaxes(rows, 0, 1), np.mean(rows, axis=0)
     good = [((part[:, 0] > 0.85) & (part[:, 1] > 0.6)).sum() for part in (before, after)]
     assert means[1, 0] > least_precision
@@ -202,5 +205,5 @@ def test_fat_of_the_organs_colour_is_told_by_nobody(kidneys):
     for seed in range(SCENES):
         scene, picture, clicks = scene_with_colours(kidneys, KINDS["fat"][0], seed, same=True)
         with suppress(InputError):
-            taught += not find(scene.frame, picture, teach(clicks)).doubt
+            taught += not find(scene.frame, picture, train_tissue_classifier(clicks)).doubt
     assert taught <= 0.1 * SCENES

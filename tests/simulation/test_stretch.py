@@ -23,7 +23,7 @@ def view() -> View:
 def test_a_stretch_keeps_the_volume_and_moves_the_organ(view, seed):
     organ = view.anatomy_ct.organ
     stretch = StretchConfig().sample(view, np.random.default_rng(seed))
-    moved = organ.moved(stretch.apply(organ.vertices_mm))
+    moved = organ.with_vertices(stretch.apply(organ.vertices_mm))
     assert moved.volume_mm3 == pytest.approx(organ.volume_mm3, rel=2e-3)  # facets of a sphere
     assert np.abs(moved.vertices_mm - organ.vertices_mm).max() > 0.5
     assert np.linalg.det(stretch.matrix) == pytest.approx(1, abs=1e-12)

@@ -13,7 +13,7 @@ from clock import PATIENCE_S
 from live_objects import PARTS, STAMP_NS, small_estimate, small_frame
 from reports import poor
 from tumortrack.core.errors import NoEstimate
-from tumortrack.core.geometry import HERE, rigid
+from tumortrack.core.geometry import IDENTITY, rigid
 from tumortrack.core.report import Finding
 from tumortrack.live.cameras import Cameras
 from tumortrack.live.loop import Loop, LoopConfig, summary
@@ -71,7 +71,7 @@ class Located(Tracker):
     def __init__(self, *verdicts):  # no model
         self._verdicts, self.asked = list(verdicts), []
 
-    def follow(self, cloud, last=None, how=None, seen=None, *, views=(), evidence=()):
+    def follow(self, cloud, last=None, how=None, full_view=None, *, views=(), evidence=()):
         self.asked.append((last, (*views, *evidence)))
         verdict = self._verdicts.pop(0) if self._verdicts else "good"
         if verdict == "none":
@@ -106,7 +106,13 @@ def once(source):
 
 
 def played(
-    sources, places=(HERE,), published=None, tracker=None, config=None, controller=None, sink=None
+    sources,
+    places=(IDENTITY,),
+    published=None,
+    tracker=None,
+    config=None,
+    controller=None,
+    sink=None,
 ):
     """The loop's results over sources (one try each), and its report."""
     tracker = tracker or Located()

@@ -11,8 +11,8 @@ from typing import Any
 
 import needs
 
-HERE = Path(__file__).parent
-FOLDER = HERE.parents[1] / ".clients"
+IDENTITY = Path(__file__).parent
+FOLDER = IDENTITY.parents[1] / ".clients"
 
 
 def environment(package: str) -> dict[str, str]:
@@ -22,7 +22,7 @@ def environment(package: str) -> dict[str, str]:
     if not (FOLDER / ".installed").exists() or not site.is_dir():
         needs.missing(f"{package}: make clients (Python 3.11 on x86-64)")
     libraries = [FOLDER / "lib", *sorted(site.glob("ros_*.libs"))]
-    paths = [HERE, site, *filter(None, [os.environ.get("PYTHONPATH")])]
+    paths = [IDENTITY, site, *filter(None, [os.environ.get("PYTHONPATH")])]
     return {
         **os.environ,
         "AMENT_PREFIX_PATH": str(FOLDER),
@@ -34,7 +34,7 @@ def environment(package: str) -> dict[str, str]:
 
 def said(environment: dict[str, str], script: str, *arguments: object) -> list[Any]:
     """What a script of this folder says: each line of its standard output, which is JSON."""
-    command = [sys.executable, str(HERE / script), *map(str, arguments)]
+    command = [sys.executable, str(IDENTITY / script), *map(str, arguments)]
     run = subprocess.run(
         command, check=False, capture_output=True, text=True, timeout=600, env=environment
     )

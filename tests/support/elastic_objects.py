@@ -29,6 +29,6 @@ def bent(anatomy: Anatomy, share: float) -> Anatomy:
         off = mesh.vertices_mm - middle
         end = off[:, 2:] / half
         wider = off * np.where([True, True, False], 1 + 0.5 * share * end, 1)
-        return mesh.moved(middle + wider + share * np.array([14.0, 0, 0]) * end**2)
+        return mesh.with_vertices(middle + wider + share * np.array([14.0, 0, 0]) * end**2)
 
     return Anatomy(tuple(moved(part) for part in anatomy.parts))

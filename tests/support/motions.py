@@ -24,11 +24,11 @@ class Wave:
     height_mm: float = 5.0
     sure: bool = False
 
-    def carry(self, points_ct: np.ndarray) -> np.ndarray:
+    def forward(self, points_ct: np.ndarray) -> np.ndarray:
         moved = points_ct + self.height_mm * np.sin(points_ct @ WAVE)[:, None] * ALONG
         return transform_points(CAMERA_FROM_CT, moved)
 
-    def back(self, points_camera: np.ndarray) -> np.ndarray:
+    def inverse(self, points_camera: np.ndarray) -> np.ndarray:
         moved = transform_points(np.linalg.inv(CAMERA_FROM_CT), points_camera)
         return moved - self.height_mm * np.sin(moved @ WAVE)[:, None] * ALONG
 

@@ -10,9 +10,9 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class OneWay:
-    carry: Callable[[np.ndarray], np.ndarray]
+    forward: Callable[[np.ndarray], np.ndarray]
 
-    def back(self, points_camera: np.ndarray, /) -> None:
+    def inverse(self, points_camera: np.ndarray, /) -> None:
         return None
 
     def std_mm(self, points_ct: np.ndarray, /) -> None:

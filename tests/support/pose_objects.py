@@ -28,13 +28,13 @@ def lying(
 
 
 def seen(
-    motion: ElasticMotion, hidden: float = 0.0, camera_from_look: Affine | None = None
+    motion: ElasticMotion, hidden: float = 0.0, camera_from_view: Affine | None = None
 ) -> np.ndarray:
     """Points (n, 3) of the side before a camera, its frame, 0.2 mm of noise; without the share of
     them at one end of the organ."""
-    into = np.eye(4) if camera_from_look is None else np.linalg.inv(camera_from_look)
+    into = np.eye(4) if camera_from_view is None else np.linalg.inv(camera_from_view)
     organ = motion.shape.anatomy_ct.organ
-    places = transform_points(into, motion.carry(organ.vertices_mm))
+    places = transform_points(into, motion.forward(organ.vertices_mm))
     depth_mm = render_depth(places, organ.faces, CAMERA).depth_mm
     row, column = np.nonzero(np.isfinite(depth_mm))
     z = depth_mm[row, column].astype(float)

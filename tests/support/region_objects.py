@@ -87,7 +87,7 @@ def make_scene(
     ground = _Ground(props, sunk_mm, size_mm, rng)
     things = [
         (BACKGROUND, ground.surface()),
-        (ORGAN, organ.moved(transform_points(table_from_organ, organ.vertices_mm))),
+        (ORGAN, organ.with_vertices(transform_points(table_from_organ, organ.vertices_mm))),
     ]
     if props.fat:
         things.append((FAT, _fat(things[1][1], rng)))

@@ -21,7 +21,9 @@ def ellipsoid(
     half_axes_mm: ArrayLike, center_mm: ArrayLike = (0, 0, 0), subdivisions: int = 4
 ) -> Mesh:
     unit = sphere(1.0, (0, 0, 0), subdivisions)
-    return unit.moved(unit.vertices_mm * np.array(half_axes_mm) + np.array(center_mm, float))
+    return unit.with_vertices(
+        unit.vertices_mm * np.array(half_axes_mm) + np.array(center_mm, float)
+    )
 
 
 def bumpy(radius_mm: float, center_mm: ArrayLike, subdivisions: int = 4) -> Mesh:
@@ -29,7 +31,7 @@ def bumpy(radius_mm: float, center_mm: ArrayLike, subdivisions: int = 4) -> Mesh
     unit = sphere(1.0, (0, 0, 0), subdivisions)
     x, y, z = unit.vertices_mm.T
     radius = radius_mm * (1 + 0.18 * np.sin(5 * x + 1) * np.cos(4 * y) + 0.12 * np.sin(7 * z))
-    return unit.moved(unit.vertices_mm * radius[:, None] + np.array(center_mm, float))
+    return unit.with_vertices(unit.vertices_mm * radius[:, None] + np.array(center_mm, float))
 
 
 # The parts of ``anatomy()`` as half axes and centre: a kidney's size, tumors inside.

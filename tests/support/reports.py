@@ -11,13 +11,19 @@ import numpy as np
 
 from tumortrack.core.assessment import ErrorBound
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.geometry import HERE
+from tumortrack.core.geometry import IDENTITY
 from tumortrack.core.report import Finding, FitReport, NextEvidence
-from tumortrack.core.types import DepthFrame, Look, SensorCloud
+from tumortrack.core.types import DepthFrame, SensorCloud, View
 
 NOWHERE = {
     "camera_from_ct": [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]],
-    **{"coefficients": [], "rarity": 0.3, "steps": 4, "compliance_std_mm": None, "misfit_mm": 0.1},
+    **{
+        "coefficients": [],
+        "normalized_mahalanobis": 0.3,
+        "steps": 4,
+        "compliance_std_mm": None,
+        "misfit_mm": 0.1,
+    },
 }
 
 
@@ -48,12 +54,12 @@ def bounded(estimate: Estimate, **bounds_mm: float) -> Estimate:
     return estimate.assessed(finding=None, bounds=bounds)
 
 
-def looked(seen: DepthFrame | SensorCloud) -> list[Look]:
-    """One look; of a cloud all points are the organ's."""
-    organ = seen if isinstance(seen, SensorCloud) else SensorCloud(np.zeros((1, 3)))
-    return [Look(organ, seen, HERE)]
+def looked(full_view: DepthFrame | SensorCloud) -> list[View]:
+    """One view; of a cloud all points are the organ's."""
+    organ = full_view if isinstance(full_view, SensorCloud) else SensorCloud(np.zeros((1, 3)))
+    return [View(organ, full_view, IDENTITY)]
 
 
 def poor(words: str) -> Finding:
     """A reason of a test's own."""
-    return Finding("model", {"words": words})
+    return Finding("model", {"message": words})

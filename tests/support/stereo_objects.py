@@ -118,11 +118,11 @@ class StereoScene:
         return cv2.GaussianBlur(picture, (0, 0), 0.7)
 
 
-def over_a_table(organ: Mesh, left_from_ct: np.ndarray, **look: Any) -> StereoScene:
+def over_a_table(organ: Mesh, left_from_ct: np.ndarray, **view: Any) -> StereoScene:
     """The organ as it is placed, red, above a blue table."""
     placed = Mesh(transform_points(left_from_ct, organ.vertices_mm), organ.faces)
     below = table(placed.box_mm[1, 2] + 3)
-    return StereoScene((placed, below), ((150, 70, 60), (60, 90, 120)), **look)
+    return StereoScene((placed, below), ((150, 70, 60), (60, 90, 120)), **view)
 
 
 def table(depth_mm: float, tilt_degrees: float = 8.0, half_mm: float = 300.0) -> Mesh:

@@ -98,8 +98,8 @@ def trained(case: Path, model: Path) -> None:
     succeeded(tumortrack(*train_command(case, model)))
 
 
-def write_clinic(case: Path, model: Path) -> None:
-    """Write a model folder of the preset clinic."""
+def write_elastic(case: Path, model: Path) -> None:
+    """Write a model folder of the preset elastic."""
     model.mkdir()
     save_model(make_model(load_case(case)), model)
 

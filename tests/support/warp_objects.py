@@ -1,4 +1,4 @@
-"""The elastic objects' organ as a `clinic` model knows it, and a model made in seconds."""
+"""The elastic objects' organ as a `elastic` model knows it, and a model made in seconds."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from tumortrack.organ.body import build_body
 from tumortrack.organ.rest_shape import DistanceField, RestShape, distances_of
 from tumortrack.registration.config import GaussNewtonConfig, RegistrationConfig
 from tumortrack.registration.gauss_newton import GaussNewton, RegistrationResult, refine
-from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import build_model
 from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.multi_view import MultiViewCloud
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.search import PosePrior
 from tumortrack.simulation.deform import ElasticConfig
@@ -73,12 +73,12 @@ def with_slope(field: DistanceField, points: np.ndarray) -> tuple[np.ndarray, np
 
 def refined(points_mm, start, config=GaussNewtonConfig()) -> RegistrationResult:  # noqa: B008
     """The fit of this organ to one camera's points."""
-    return refine(shape(), Looks.of([points_mm]), start, config)
+    return refine(shape(), MultiViewCloud.from_points([points_mm]), start, config)
 
 
 def descent(points_mm, start, config=GaussNewtonConfig(), moved=None) -> GaussNewton:  # noqa: B008
     """The same, before its first step."""
-    return GaussNewton(shape(), Looks.of([points_mm]), start, config, moved)
+    return GaussNewton(shape(), MultiViewCloud.from_points([points_mm]), start, config, moved)
 
 
 def method(config: GaussNewtonConfig | None = None, tilt_degrees: float = 30.0) -> Registration:
@@ -87,13 +87,13 @@ def method(config: GaussNewtonConfig | None = None, tilt_degrees: float = 30.0) 
     return Registration(shape(), config or GaussNewtonConfig(), prior)
 
 
-def slim_clinic() -> RegistrationConfig:
+def slim_elastic() -> RegistrationConfig:
     """A small body and clean, small pictures: a model is made in seconds."""
     scene = SceneConfig(width=212, height=120, deform=(ElasticConfig(body=SMALL),))
     return RegistrationConfig(scene=scene, scenes=24, searched=12)
 
 
 def write_slim(folder: Path) -> None:
-    """Write a model folder of the slim clinic."""
+    """Write a model folder of the slim elastic."""
     folder.mkdir()
-    save_model(build_model(ANATOMY, UP, slim_clinic()), folder)
+    save_model(build_model(ANATOMY, UP, slim_elastic()), folder)

@@ -12,18 +12,18 @@ import pytest
 from tumortrack.core.camera import d405, deproject
 from tumortrack.core.errors import NotThisOrgan
 from tumortrack.core.render import render_depth
-from tumortrack.core.types import Look, SensorCloud
+from tumortrack.core.types import SensorCloud, View
 from tumortrack.segmentation import Hints
 from tumortrack.tracking.options import LocateOptions
 from tumortrack.tracking.pieces import likeliest_piece
-from tumortrack.tracking.views import View, as_fitted
+from tumortrack.tracking.views import ViewFile, as_fitted
 from warp_objects import ANATOMY, placed
 
 
 @pytest.fixture(scope="module")
 def image():
     """The organ, and beside it a plate, nearer than the table under both."""
-    organ = placed(share=0.3).carry(ANATOMY.organ.vertices_mm)
+    organ = placed(share=0.3).forward(ANATOMY.organ.vertices_mm)
     frame = render_depth(organ, ANATOMY.organ.faces, d405(424, 240))
     depth = np.where(np.isnan(frame.depth_mm), np.nanmax(frame.depth_mm) + 30, frame.depth_mm)
     there = np.zeros(depth.shape, bool)
@@ -40,29 +40,29 @@ def thinned(points):
 
 def test_the_organ_is_found_beside_what_looked_more_like_it(tracker, image):
     seen, organ, plate = image
-    alone = tracker.locate(organ, grid=16, seen=seen)
+    alone = tracker.locate(organ, grid=16, full_view=seen)
     for locate in (partial(tracker.locate, grid=16), tracker.follow):
-        found = locate(replace(plate, others=(organ,)), seen=seen)
+        found = locate(replace(plate, others=(organ,)), full_view=seen)
         away_mm = np.abs(found.organ_mesh.box_mm - alone.organ_mesh.box_mm).max()
         assert away_mm < 0.5
         assert found.report.piece == 1
         assert found.report.timings["pieces"] > 0
     with pytest.raises(NotThisOrgan):
-        tracker.locate(plate, grid=16, seen=seen)
+        tracker.locate(plate, grid=16, full_view=seen)
 
 
 def test_what_is_the_organ_is_tried_alone_and_what_is_not_to_the_end(tracker, image):
     seen, organ, plate = image
     tries = []
 
-    def located(looks):
-        tries.append(len(looks[0].cloud.points_mm))
-        return tracker.locate(replace(looks[0].cloud, others=()), grid=16, seen=seen)
+    def located(views):
+        tries.append(len(views[0].cloud.points_mm))
+        return tracker.locate(replace(views[0].cloud, others=()), grid=16, full_view=seen)
 
     for first, others, count in ((organ, (plate,), 1), (plate, (plate, organ, plate), 4)):
         tries.clear()
-        look = Look(replace(first, others=others), seen, np.eye(4))
-        likeliest_piece((look,), located)
+        view = View(replace(first, others=others), seen, np.eye(4))
+        likeliest_piece((view,), located)
         assert len(tries) == count
 
 
@@ -70,7 +70,7 @@ def test_what_is_the_organ_is_tried_alone_and_what_is_not_to_the_end(tracker, im
 @pytest.mark.parametrize("along", [(0, 0), (10, -35), (-25, 25)])
 def test_an_organ_behind_an_occluder_stays_one(tracker, along, width_px):
     """A band parts the organ; both parts are found, and nothing of the band."""
-    organ = placed(share=0.3).carry(ANATOMY.organ.vertices_mm)
+    organ = placed(share=0.3).forward(ANATOMY.organ.vertices_mm)
     clean = render_depth(organ, ANATOMY.organ.faces, d405(424, 240))
     image = np.isfinite(clean.depth_mm)
     v, u = np.indices(image.shape)
@@ -83,10 +83,10 @@ def test_an_organ_behind_an_occluder_stays_one(tracker, along, width_px):
     off = across[0] * (u - columns.mean()) + across[1] * (v - rows.mean())
     band = np.abs(off) < width_px / 2
     depth = np.where(band, np.nanmin(clean.depth_mm) - 15, clean.depth_mm).astype(np.float32)
-    view = View(Path("depth.png"), clean.with_depth(depth))
+    view = ViewFile(Path("depth.png"), clean.with_depth(depth))
     found = view.organ(tracker.model, LocateOptions(), Hints())
-    estimate = tracker.locate(found.cloud, grid=16, seen=view.content)
+    estimate = tracker.locate(found.cloud, grid=16, full_view=view.content)
     (fitted,) = as_fitted([view], [found], estimate, tracker.model)
-    taken = fitted.taken == 0
+    taken = fitted.pixel_class == 0
     assert not taken[band].any()
     assert taken[image & ~band].mean() > 0.95

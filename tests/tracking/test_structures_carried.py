@@ -41,7 +41,7 @@ def carried(slim_model):
 
 def test_it_moves_as_the_motion_says(carried):
     sheet, estimate = carried
-    there = estimate.motion.carry(sheet.vertices_mm)
+    there = estimate.motion.forward(sheet.vertices_mm)
     assert estimate.structures["cut"].vertices_mm == pytest.approx(there, abs=1e-4)
     assert np.linalg.norm(there - sheet.vertices_mm, axis=1).min() > 10
     assert set(estimate.meshes) == set(estimate.report.parts)

@@ -38,12 +38,14 @@ def anatomy_ct():
 
 
 def truth():
-    return Anatomy(tuple(p.moved(Wave().carry(p.vertices_mm)) for p in anatomy_ct().parts))
+    return Anatomy(
+        tuple(p.with_vertices(Wave().forward(p.vertices_mm)) for p in anatomy_ct().parts)
+    )
 
 
 def scene(with_targets=True):
     inner = draw_targets(anatomy_ct(), 0)
-    targets = inner.at(Wave().carry(inner.points_ct)) if with_targets else None
+    targets = inner.at(Wave().forward(inner.points_ct)) if with_targets else None
     return Scene(SensorCloud(truth().organ.vertices_mm), truth(), targets=targets)
 
 
@@ -59,7 +61,7 @@ def estimate(motion):
 
 
 def shifted(distance_mm):
-    return OneWay(lambda points: Wave().carry(points) + [0.0, distance_mm, 0.0])
+    return OneWay(lambda points: Wave().forward(points) + [0.0, distance_mm, 0.0])
 
 
 # --- the figure ---
@@ -70,7 +72,7 @@ def test_known_errors_give_known_figures():
     targets = Targets(ct, ct, np.ones(100, np.uint8))
     errors = np.arange(1.0, 101.0)
     motion = OneWay(lambda points: points + errors[:, None] * [0.6, 0.0, 0.8])
-    found = target_errors(motion.carry(ct), targets)
+    found = target_errors(motion.forward(ct), targets)
     assert found["mean"] == pytest.approx(50.5)
     assert found["median"] == pytest.approx(50.5)
     assert found["rms"] == pytest.approx(np.sqrt(101 * 201 / 6))
@@ -82,8 +84,8 @@ def test_known_errors_give_known_figures():
 
 def test_the_true_motion_has_no_error_and_a_rigid_one_has_the_waves():
     targets = scene().targets
-    assert target_errors(Wave().carry(targets.points_ct), targets)["max"] < 1e-9
-    rigid = target_errors(Wave(height_mm=0.0).carry(targets.points_ct), targets)
+    assert target_errors(Wave().forward(targets.points_ct), targets)["max"] < 1e-9
+    rigid = target_errors(Wave(height_mm=0.0).forward(targets.points_ct), targets)
     wave = 5 * np.abs(np.sin(targets.points_ct @ [0.02, 0.05, 0.01]))
     assert rigid["max"] == pytest.approx(wave.max())
     assert rigid["mean"] == pytest.approx(wave.mean())

@@ -177,7 +177,7 @@ class ScenePlayer:
         poses = self._camera_at(t_s), room_from_organ, room_from_rod
         return Instant(t_s, *poses, velocity, depth_mm)
 
-    def carry(self, instant: Instant, points_ct: Points) -> Float64[np.ndarray, "n 3"]:
+    def forward(self, instant: Instant, points_ct: Points) -> Float64[np.ndarray, "n 3"]:
         """Points of the CT in the camera frame."""
         camera_from_organ = instant.camera_from_room @ instant.room_from_organ
         return transform_points(camera_from_organ, self._deformed(instant.velocity, points_ct))
@@ -187,8 +187,10 @@ class ScenePlayer:
         parts = self.anatomy_ct.parts
         ends = np.cumsum([len(part.vertices_mm) for part in parts])
         pulled_mm = 0.0 if self._pulled is None else self._pulled.at(pull_mm)
-        vertices = np.split(self.carry(instant, self._vertices + pulled_mm), ends[:-1])
-        return self.anatomy_ct.of(part.moved(v) for part, v in zip(parts, vertices, strict=True))
+        vertices = np.split(self.forward(instant, self._vertices + pulled_mm), ends[:-1])
+        return self.anatomy_ct.with_parts(
+            part.with_vertices(v) for part, v in zip(parts, vertices, strict=True)
+        )
 
     def frame(self, instant: Instant, truth: Anatomy, stamp_ns: int) -> DepthFrame:
         """The sensor's depth image at an instant with these true surfaces. Its noise follows from

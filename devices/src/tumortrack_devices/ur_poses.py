@@ -68,7 +68,7 @@ class UrPoses(CameraPoses):
         except NoEstimate as error:
             if not (trouble := self.trouble):
                 raise
-            raise NoEstimate(Finding("source", {"words": trouble})) from error
+            raise NoEstimate(Finding("source", {"message": trouble})) from error
 
     def close(self) -> None:
         self._closed.set()

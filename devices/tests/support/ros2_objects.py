@@ -25,8 +25,8 @@ from tumortrack.live.values import Observation, Source
 from tumortrack_devices.ros.bus import Bus, open_bus
 from tumortrack_devices.ros.sensors import messages_seen
 
-HERE = Path(__file__).parent
-PATHS = (HERE.parents[2] / "tests" / "support", os.environ.get("PYTHONPATH", ""))
+IDENTITY = Path(__file__).parent
+PATHS = (IDENTITY.parents[2] / "tests" / "support", os.environ.get("PYTHONPATH", ""))
 N_TOPICS = 3 + len(PARTS)
 # Each of a run's workers has domains of its own; which, is drawn, for another run may be under way.
 # Ports of domains beyond 100 reach into the ephemeral ones.
@@ -105,7 +105,7 @@ class Other:
             [str(part) for part in command],
             stdout=subprocess.PIPE,
             text=True,
-            cwd=HERE,
+            cwd=IDENTITY,
             env=environment or {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, PATHS))},
             start_new_session=True,
         )
@@ -177,5 +177,5 @@ OURS, THROUGH_RCLPY, RCLPY = "ours", "ours through rclpy", "rclpy"
 def peer(*arguments: object, by: str = OURS) -> Iterator[Other]:
     script = "rclpy_peer.py" if by == RCLPY else "ros2_peer.py"
     environment = None if by == OURS else clients.environment("ros-jazzy-rclpy")
-    with process(sys.executable, HERE / script, *arguments, environment=environment) as other:
+    with process(sys.executable, IDENTITY / script, *arguments, environment=environment) as other:
         yield other

@@ -175,7 +175,7 @@ def a_view(
     """What a D405 sees of the bench."""
     organ = case.anatomy.organ
     organ_mm = transform_points(BASE_FROM_CT, organ.vertices_mm) * state.stretch
-    solids = [box_mesh(TABLE), box_mesh(PLATE), organ.moved(organ_mm)]
+    solids = [box_mesh(TABLE), box_mesh(PLATE), organ.with_vertices(organ_mm)]
     if state.press:
         solids.append(box_mesh(PRESS))
     for bead in state.beads_mm:

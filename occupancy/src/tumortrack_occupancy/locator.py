@@ -15,7 +15,7 @@ from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.evidence import Evidence
 from tumortrack.core.report import Finding, FitReport
-from tumortrack.core.types import Anatomy, CameraLabels, Look, OccupancyCloud, SensorCloud
+from tumortrack.core.types import Anatomy, CameraLabels, OccupancyCloud, SensorCloud, View
 from tumortrack.registration.frame import Frame, Rng, describe_parts, grid_over, residuals
 from tumortrack.registration.in_distribution import check_in_distribution
 from tumortrack_occupancy import volume
@@ -42,7 +42,7 @@ class OccupancyLocator:
 
     def locate(
         self,
-        looks: Sequence[Look],
+        views: Sequence[View],
         grid: int,
         seed: int,
         evidence: Sequence[Evidence] = (),
@@ -51,7 +51,7 @@ class OccupancyLocator:
         """See ``tracking.tracker.Tracker.locate``. The two passes of queries are those of the
         follow-up (LUDO): 10,000 coarse ones where the organ can be, then 40,000 in the enlarged box
         of those inside."""
-        frame = _Frame(self, _only_cloud(looks, evidence), seed, np.random.default_rng(seed))
+        frame = _Frame(self, _only_cloud(views, evidence), seed, np.random.default_rng(seed))
         lattice = frame.lattice(frame.coarse_box())
         distances_mm = frame.checked(lattice)
         inside = frame.inside(lattice)
@@ -60,17 +60,17 @@ class OccupancyLocator:
             margins, labels = sparse_margins(frame.logits_at, camera_from_index, shape)
         return frame.estimate(distances_mm, inside, margins, labels, camera_from_index)
 
-    def follow(self, looks: Sequence[Look], last: Estimate | None, how: FollowOptions) -> Estimate:
+    def follow(self, views: Sequence[View], last: Estimate | None, how: FollowOptions) -> Estimate:
         """See ``tracking.tracker.Tracker.follow``. The enlarged box of the last organ replaces the
         coarse queries, and its lattice is queried only where the organ is (``organ_lattice``). If
-        the organ reaches the box's border, there is no last estimate, or with ``thorough``, it is
-        searched for as in a first frame, with every lattice point queried. The surfaces' grid is
+        the organ reaches the box's border, there is no last estimate, or with ``global_search``, it
+        is searched for as in a first frame, with every lattice point queried. The surfaces' grid is
         twice as fine as the lattice, and queried only near surfaces."""
-        cloud = _only_cloud(looks)
+        cloud = _only_cloud(views)
         rng = np.random.default_rng((how.seed, cloud.stamp_ns))
         frame = _Frame(self, cloud, how.seed, rng)
         lattice = None
-        if last is not None and not how.thorough:
+        if last is not None and not how.global_search:
             low, high = last.cloud.points_mm.min(0), last.cloud.points_mm.max(0)
             margin = _LIVE_MARGIN * float((high - low).max())
             lattice = frame.lattice(np.stack([low - margin, high + margin]).astype(float))
@@ -97,13 +97,13 @@ class OccupancyLocator:
         volume.part_surfaces(margins, ball.astype(np.uint8), np.eye(4), self.model.parts[:1])
 
 
-def _only_cloud(looks: Sequence[Look], evidence: Sequence[Evidence] = ()) -> SensorCloud:
-    if len(looks) > 1 or evidence:
+def _only_cloud(views: Sequence[View], evidence: Sequence[Evidence] = ()) -> SensorCloud:
+    if len(views) > 1 or evidence:
         raise InputError(
-            "several looks, and evidence, need a model that knows a motion: preset clinic; quick "
+            "several views, and evidence, need a model that knows a motion: preset elastic; quick "
             "and paper take one cloud."
         )
-    return looks[0].cloud
+    return views[0].cloud
 
 
 class _Frame(Frame):

@@ -111,13 +111,13 @@ class ErrorBudget(Config, frozen=True, kw_only=True):
         return Halt("over_budget", {**values, "term": term, "term_mm": term_mm})
 
     @property
-    def words(self) -> str:
-        return self.as_halt.words
+    def message(self) -> str:
+        return self.as_halt.message
 
     def table(self) -> list[str]:
         lines = [f"errors that the electrode's distance to {self.part} has to cover, mm:"]
         for name, value in self.terms.items():
-            how = ErrorBound(value).words if name == "tracking" else ""
+            how = ErrorBound(value).message if name == "tracking" else ""
             how = "assumed" if name in self.assumed else how
             lines.append(f"  {name:<9}{value:5.1f}  {how}".rstrip())
         of = f"of {self.margin_mm:.1f}" if self.margin_mm > 0 else "of none: it is cut"
@@ -175,10 +175,10 @@ def checked_against(
     notes = [f"{budget.left_mm:.1f} mm are left of the distance to {budget.part} after "
              f"{budget.sum_mm:.1f} mm of error."]  # fmt: skip
     if over:
-        notes = [f"{OVER_BUDGET}: {budget.words}." for budget in over]
+        notes = [f"{OVER_BUDGET}: {budget.message}." for budget in over]
         if not accept:
             raise NoPlan(
-                f"the distance does not cover the errors: {over[0].words}. "
+                f"the distance does not cover the errors: {over[0].message}. "
                 f"{_remedy(plan, over[0])} Only for a plan that nobody carries out, accept it "
                 "(--accept-budget, accept_budget=True)."
             )
@@ -250,7 +250,7 @@ def _remedy(plan: ResectionPlan, budget: ErrorBudget) -> str:
     if budget.part != plan.tumor:
         return f"Plan {budget.part} as well, or look from nearer."
     if enough_mm > MARGIN_MM[1]:
-        return "Look from nearer, or uncover more of the organ."
+        return "View from nearer, or uncover more of the organ."
     return f"{enough_mm:g} mm would cover them (--margin, margin_mm)."
 
 

@@ -202,11 +202,11 @@ def _least(
     new, waiting = [(0, last)], list[tuple[float, int, int]]()
     while True:
         for left, right in new:
-            apart_mm = float(at_mm[right] - at_mm[left])
-            if not abs(seen[left] - seen[right]) <= apart_mm + _DOUBTFUL_MM:
+            distance_mm = float(at_mm[right] - at_mm[left])
+            if not abs(seen[left] - seen[right]) <= distance_mm + _DOUBTFUL_MM:
                 return int(among[right]), np.nan
             if right - left > 1:
-                bound_mm = (seen[left] + seen[right] - apart_mm) / 2
+                bound_mm = (seen[left] + seen[right] - distance_mm) / 2
                 heapq.heappush(waiting, (bound_mm, left, right))
         if seen[best] <= enough_mm or not waiting or waiting[0][0] >= seen[best] - _EXACT_MM:
             return int(among[best]), seen[best]

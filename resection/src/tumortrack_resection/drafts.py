@@ -65,7 +65,7 @@ class _Unfit(NamedTuple):
     """Why a piece can't be planned; ``normals``: to blame; ``tool``: a longer electrode would
     do."""
 
-    words: str
+    message: str
     normals: tuple[int, ...] = ()
     tool: bool = False
 
@@ -266,7 +266,7 @@ class Drafts:
         if loose_mm3 > _LOOSE_MM3:
             return _Unfit(f"{loose_mm3 / 1000:.0f} ml beside the piece would come off, too.")
         solid = mesh_of(trimmed(self._solid, piece.planes, tools.radius_mm))
-        healthy = located.of(ORGAN)
+        healthy = located.points_of(ORGAN)
         inner = float(inside(piece.planes, healthy, tools.radius_mm).mean())
         outer = float(inside(piece.planes, healthy, -tools.radius_mm).mean())
         return Draft(
@@ -312,7 +312,7 @@ class Drafts:
                 if other not in self._config.keep_away
             )  # fmt: skip
             notes.append(f"{NO_ROOM} {margin_mm:g} mm from other tumors; kept are {least}.")
-        healthy = located.of(ORGAN)[::_EVERY]
+        healthy = located.points_of(ORGAN)[::_EVERY]
         surface = cKDTree(located.meshes[name].spread_mm(_SHELL_MM))
         shell = float((surface.query(healthy)[0] < margin_mm).mean())
         notes.append(
@@ -324,7 +324,7 @@ class Drafts:
     def _why_not(self, reasons: list[_Unfit]) -> str:
         for reason in reasons:
             if reason.tool:
-                return reason.words
+                return reason.message
         located, name, tools = self._located, name_of(self._label), self._tools
         tumor = cKDTree(located.meshes[name].spread_mm(1.0))
         surfaces, tight = located.surfaces, []
@@ -343,7 +343,7 @@ class Drafts:
                 f"for less distance (--keep-away {other}=0.5), or plan the other one."
             )
         if reasons:
-            return reasons[0].words
+            return reasons[0].message
         return (
             f"no piece with up to {self._config.most_facets} plane facets round {name} can be cut "
             "and lifted out. Place the organ otherwise, or ask for a smaller margin."
@@ -357,7 +357,7 @@ class Drafts:
         high_mm = float(located.organ.box_mm[1, 2]) + 1.0
         prism = area.extrude(high_mm - low_mm).translate((0.0, 0.0, low_mm))
         piece = mesh_of(self._solid ^ prism)
-        healthy = contains(piece, located.of(ORGAN)).mean()
+        healthy = contains(piece, located.points_of(ORGAN)).mean()
         if healthy > self._config.most_healthy:
             raise NoPlan(
                 f"{healthy:.0%} of the organ's healthy tissue would come away; allowed are "
@@ -410,7 +410,7 @@ def plan_resection(
 
 def chosen_tumor(located: Located, config: ResectionConfig) -> tuple[int, float]:
     """Label of the tumor to cut out, and its share outside the organ's hull."""
-    if len(located.of(ORGAN)) < _FEWEST:
+    if len(located.points_of(ORGAN)) < _FEWEST:
         raise NoPlan("no organ was located, so nothing can be planned. Locate it first.")
     if not located.tumors:
         raise NoPlan("no tumor was located, so there is nothing to cut out.")
@@ -420,7 +420,7 @@ def chosen_tumor(located: Located, config: ResectionConfig) -> tuple[int, float]
     candidates = [names[config.tumor]] if config.tumor else list(names.values())
     shares = exophytic_shares(located, candidates)
     label = max(shares, key=lambda tumor: shares[tumor])
-    name, n = name_of(label), len(located.of(label))
+    name, n = name_of(label), len(located.points_of(label))
     if n < _FEWEST:
         raise NoPlan(f"{name} has only {n} points; {_FEWEST} are needed. Locate with more points.")
     if shares[label] < config.least_exophytic:
@@ -440,7 +440,7 @@ def chosen_tumor(located: Located, config: ResectionConfig) -> tuple[int, float]
 def exophytic_shares(located: Located, labels: list[int]) -> dict[int, float]:
     """How much of each tumor lies outside the convex hull of the organ without tumors, which
     needs only the farthest point in each of many directions."""
-    organ = located.of(ORGAN)
+    organ = located.points_of(ORGAN)
     organ = organ[:: 1 + len(organ) // _MOST]
     farthest = (sphere(_DIRECTIONS).astype(np.float32) @ organ.T.astype(np.float32)).argmax(axis=1)
     try:
@@ -450,7 +450,7 @@ def exophytic_shares(located: Located, labels: list[int]) -> dict[int, float]:
     normals, offsets = np.split(hull.equations.astype(np.float32), [3], axis=1)
     shares = {}
     for label in labels:
-        points = located.of(label).astype(np.float32)
+        points = located.points_of(label).astype(np.float32)
         outside = (normals @ points.T + offsets).max(axis=0) > 0
         shares[label] = float(outside.mean()) if len(points) else 0.0
     return shares

@@ -87,7 +87,7 @@ class FacetSearch:
         kerf_mm = tools.radius_mm
         room_mm = config.margin_mm + kerf_mm + SLACK_MM
         self._offsets = (self._normals @ points.T).max(1) + room_mm
-        healthy = located.of(ORGAN)
+        healthy = located.points_of(ORGAN)
         healthy = healthy[:: 1 + len(healthy) // _POINTS].astype(float)
         beyond = self._normals @ healthy.T > self._offsets[:, None] + kerf_mm
         self._choice = _Choice(self._normals, beyond, self._near(self._offsets))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.core.evidence import Evidence, Held
+from tumortrack.core.evidence import Evidence, Grasp
 from tumortrack.core.geometry import Affine, transform_points
 from tumortrack.live.values import TrackingResult
 from tumortrack_resection.budget import ErrorBudget
@@ -60,7 +60,7 @@ class Grip:
         if self._taken is None or self._tip_mm is None:
             return ()
         tip_mm = transform_points(camera_from_published, self._tip_mm[None])[0]
-        held = Held(
+        held = Grasp(
             point_ct=self._taken.point_ct, point_std_mm=self._taken.std_mm,
             place_mm=tuple(tip_mm.tolist()), std_mm=math.hypot(self._std_mm, self._step_mm),
             stamp_ns=stamp_ns, tool=HOLDER,
@@ -83,7 +83,7 @@ def _point_at(tip_mm: Place, result: TrackingResult) -> _Taken | None:
     if motion is None:
         return None
     camera_from_published = np.linalg.inv(result.published_frame.published_from_camera)
-    point_ct = motion.back(transform_points(camera_from_published, tip_mm[None]))
+    point_ct = motion.inverse(transform_points(camera_from_published, tip_mm[None]))
     if point_ct is None or (std_mm := motion.std_mm(point_ct)) is None:
         return None
     return _Taken(tuple(point_ct[0].tolist()), float(std_mm[0]))

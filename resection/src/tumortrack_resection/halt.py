@@ -36,13 +36,13 @@ class Halt(msgspec.Struct, frozen=True):
     cut: bool = False
 
     @property
-    def words(self) -> str:
+    def message(self) -> str:
         words = _SENTENCES[self.kind].format(**self.values)
         return f"{words} ({CUT_NOTE}; --replan-cut plans on them anyway)" if self.cut else words
 
     @property
     def words_without_numbers(self) -> str:
-        return self.words.translate(_WITHOUT_NUMBERS)
+        return self.message.translate(_WITHOUT_NUMBERS)
 
     @property
     def same_as(self) -> tuple[HaltKind, bool, object]:

@@ -196,7 +196,7 @@ class Operation:
 
     def stop(self, why: StopReason, words: str = "") -> None:
         """For good, from any state."""
-        self._execution.abort(Halt(why, {"words": words}))
+        self._execution.abort(Halt(why, {"message": words}))
 
     def workcell(self) -> Workcell:
         execution, plan = self._execution, self.planned.plan
@@ -216,7 +216,7 @@ class Operation:
         state = f"{execution.state} ({self._note})" if self._note else execution.state
         now = None if self._budget is None else self._budget.now
         halt, note = execution.halted, "" if now is None else now.left_words
-        stopped = "" if halt is None else halt.words
+        stopped = "" if halt is None else halt.message
         line = f"arms: {stage_words(state, self._real)}" + (f" ({stopped})" if stopped else "")
         return Workcell(
             state,
@@ -245,7 +245,7 @@ class Operation:
         resection = {
             "state": self._execution.state,
             "note": self._note,
-            "halted": self._execution.halted.words if self._execution.halted else "",
+            "halted": self._execution.halted.message if self._execution.halted else "",
             "halts": dict(self.halts.most_common()),
             "log": self.log,
             **({} if self._budget is None else {"budget": self._budget.summary()}),
@@ -273,11 +273,11 @@ class Operation:
         if self._locate is None or over or execution.sweep > self.planned.plan.sweeps:
             execution.go()  # nothing to compare, nothing moves any more, or all is cut
         elif update.estimate is None:
-            self._halt_unsettled(Halt("no_estimate", {"words": update.reason}, update.finding))
+            self._halt_unsettled(Halt("no_estimate", {"message": update.reason}, update.finding))
         elif (halt := _slipped(update)) is not None:
             self._halt_unsettled(halt)
         elif update.quality != "good":
-            self._halt_unsettled(Halt("poor", {"words": update.warning}, update.finding))
+            self._halt_unsettled(Halt("poor", {"message": update.warning}, update.finding))
         elif self._work is not None:
             execution.halt(Halt("planning"))
         elif execution.stage == Stage.PULL:
@@ -313,7 +313,7 @@ class Operation:
             execution.halt(msgspec.structs.replace(halt, cut=True))
             return
         execution.halt(self._after_a_while(halt, now_s))
-        if self._settled is None or apart_mm(tumor, self._settled[0]) > config.settled_mm:
+        if self._settled is None or distance_mm(tumor, self._settled[0]) > config.settled_mm:
             self._settled = (tumor, now_s)
         elif now_s - self._settled[1] >= config.settled_s and execution.still:
             self._settled = self._off_s = None
@@ -333,7 +333,7 @@ class Operation:
         name, moved = self.planned.plan.tumor, []
         over_budget: tuple[Halt | None, bool] = None, False
         for part, mesh in self.planned.meshes.items():
-            off_mm = apart_mm(located.meshes[part], mesh)
+            off_mm = distance_mm(located.meshes[part], mesh)
             if off_mm > self._config.moved_mm * (1.0 if part == name else _OTHER_PARTS):
                 moved.append((part == name, off_mm, part))
         if self._budget is not None:
@@ -367,10 +367,10 @@ class Operation:
             execution.replace(self.planned.motions)
             self._log(now_s, event="planned anew")
         elif isinstance(failure, TumortrackError):
-            execution.abort(Halt("no_plan", {"words": str(failure)}))
+            execution.abort(Halt("no_plan", {"message": str(failure)}))
         else:  # a defect of the planner must stop the arms, and be reported
             words = f"{type(failure).__name__}: {failure}"
-            execution.abort(Halt("defect", {"words": words}))
+            execution.abort(Halt("defect", {"message": words}))
 
     def _log(self, now_s: float, **event: str) -> None:
         at_s = round(now_s - self._first_s, 3)
@@ -381,12 +381,12 @@ def _slipped(update: TrackingResult) -> Halt | None:
     """That the estimate contradicts what the holder holds; one of them is wrong."""
     assert update.estimate is not None
     for each in update.estimate.report.evidence:
-        if each.name == "held" and each.left_out:
+        if each.name == "grasp" and each.rejected:
             return Halt("slipped", {"off_mm": each.off_mm})
     return None
 
 
-def apart_mm(a: Mesh, b: Mesh) -> float:
+def distance_mm(a: Mesh, b: Mesh) -> float:
     """How far a surface has moved, root mean square: of its vertices if the triangles are the
     same, else between the surfaces."""
     return float(np.sqrt((_distances_mm(a, b) ** 2).mean()))

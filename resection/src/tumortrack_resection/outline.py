@@ -71,7 +71,7 @@ def published_cuts(
     grown by the margin and clipped to the organ's projection, is cut along at the middle of the
     tumor's bounding box, and on its lower face. Held is the tumor's centre of mass, carried up
     to the top of the box. NoPlan: there is no contour."""
-    tumor = located.of(label)
+    tumor = located.points_of(label)
     low, high = float(tumor[:, 2].min()), float(tumor[:, 2].max())
     wide = grown(concave_hull(tumor[:, :2]), config.margin_mm)
     both = common(wide, concave_hull(located.points_mm[:, :2]))

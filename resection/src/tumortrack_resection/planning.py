@@ -158,9 +158,9 @@ def plan_cuts(
     moved_mm: float = MOVED_MM,
 ) -> Cuts:
     """Where to cut a run, without the arms."""
-    weak = (f"{WEAK_CASE}: {warning.words}." for warning in run.weak)
+    weak = (f"{WEAK_CASE}: {warning.message}." for warning in run.weak)
     heading = (*poor_estimate_notes(run.doubt, accept_poor), *weak)
-    located = run.moved(frames.published_from_camera)
+    located = run.transformed(frames.published_from_camera)
     cell = below(located.organ, cell or CellConfig())
 
     def budgets_of(plan: ResectionPlan) -> tuple[ErrorBudget, ...]:

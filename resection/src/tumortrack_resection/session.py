@@ -158,7 +158,7 @@ class ResectionSession:
 
         def locate(result: TrackingResult) -> Located:
             assert result.estimate is not None
-            return of_estimate(result.estimate).moved(frames.published_from_camera)
+            return of_estimate(result.estimate).transformed(frames.published_from_camera)
 
         config = msgspec.structs.replace(stored.config, tumor=stored.plan.tumor)
         # In a process of its own: planning takes a second, and must not delay a frame.
@@ -344,7 +344,7 @@ def _check_real(
         "a plan whose distances cover its errors (plan again with a wider margin)": (
             budget.left_mm >= 0
         ),
-        "a plan on an estimate that knows how far off its tumors may be (preset clinic, good)": (
+        "a plan on an estimate that knows how far off its tumors may be (preset elastic, good)": (
             "tracking" not in assumed
         ),
         "a plan with the calibration's error (error_mm in the --frame file)": (

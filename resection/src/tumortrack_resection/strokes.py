@@ -198,7 +198,7 @@ def grasp_point(
     slopes = np.hypot(*np.gradient(heights, _COLUMN_MM))
     cells = np.argwhere(np.isfinite(heights) & np.isfinite(slopes))
     flat = np.column_stack([low + _COLUMN_MM * cells, heights[tuple(cells.T)]])
-    middle, places = turn @ located.of(label).mean(0), flat @ turn
+    middle, places = turn @ located.points_of(label).mean(0), flat @ turn
     off = np.linalg.norm(flat[:, :2] - middle[:2], axis=1) + _STEEP_MM * slopes[tuple(cells.T)]
     for n in located.tumors:
         if n != label and n not in piece.with_it:

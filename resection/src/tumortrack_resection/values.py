@@ -102,15 +102,18 @@ class Located:
     doubt: str = ""
     weak: tuple[Finding, ...] = ()
 
-    def moved(self, b_from_a: Float[np.ndarray, "4 4"]) -> Located:
+    def transformed(self, b_from_a: Float[np.ndarray, "4 4"]) -> Located:
         points_mm = transform_points(b_from_a, self.points_mm)
         meshes, structures = (
-            {name: mesh.moved(transform_points(b_from_a, mesh.vertices_mm)) for name, mesh in of}
+            {
+                name: mesh.with_vertices(transform_points(b_from_a, mesh.vertices_mm))
+                for name, mesh in of
+            }
             for of in (self.meshes.items(), self.structures.items())
         )
         return replace(self, points_mm=points_mm, meshes=meshes, structures=structures)
 
-    def of(self, label: int) -> Float[np.ndarray, "m 3"]:
+    def points_of(self, label: int) -> Float[np.ndarray, "m 3"]:
         return self.points_mm[self.labels == label]
 
     @property

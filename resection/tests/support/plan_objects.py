@@ -76,10 +76,10 @@ class Deviating:
     def __init__(self, deviation_mm: float = 0.5) -> None:
         self.deviation_mm = deviation_mm
 
-    def carry(self, points: np.ndarray) -> np.ndarray:
+    def forward(self, points: np.ndarray) -> np.ndarray:
         return points
 
-    def back(self, points: np.ndarray) -> np.ndarray:
+    def inverse(self, points: np.ndarray) -> np.ndarray:
         return points
 
     def std_mm(self, points: np.ndarray) -> np.ndarray:

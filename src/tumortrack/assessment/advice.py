@@ -1,9 +1,9 @@
 """Advice: what to learn next of a part's place, in closed form, from the fit's covariance.
 
 A touch measures the surface of the organ along its normal, a landmark a point's place, an outline
-the border of the part, a look from another side all of the surface that faces it. By Kalman's
+the border of the part, a view from another side all of the surface that faces it. By Kalman's
 update each narrows the covariance of everything that moves with what it measures, before anybody
-takes it. Rivals count as one more unknown each, with their share of the probability.
+takes it. Alternatives count as one more unknown each, with their share of the probability.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _NEAR_MM = 2.0  # of an outline's plane
 _LEAST_GAIN_MM, _FOUND = 1 / 3, (0.7, 1.3)
 
 Place = Float64[np.ndarray, " 3"]
-Kind = Literal["touch", "outline", "landmark", "look"]
+Kind = Literal["touch", "outline", "landmark", "view"]
 # Whether a tool can touch the organ at a place, where its outward normal is this; camera frame, mm.
 Reach: TypeAlias = Callable[[Place, Place], bool]
 
@@ -192,13 +192,13 @@ class Advisor:
 
     def others(self) -> tuple[NextEvidence, ...]:
         """The best outline of the part, landmark, and look from another side."""
-        kinds = self._outlines(), self._landmarks(), self.looks()
+        kinds = self._outlines(), self._landmarks(), self.views()
         best = [min(kind, key=lambda each: each.then_std_mm, default=None) for kind in kinds]
         return tuple(each for each in best if each is not None)
 
     def _outlines(self) -> Iterator[NextEvidence]:
         mesh = self.motion.shape.anatomy_ct.parts[self.part]
-        places_mm, known = self.motion.carry(mesh.vertices_mm), self._known()
+        places_mm, known = self.motion.forward(mesh.vertices_mm), self._known()
         middle_mm = places_mm.mean(0)
         for normal in np.eye(3):
             near = places_mm[np.abs((places_mm - middle_mm) @ normal) < _NEAR_MM]
@@ -211,10 +211,10 @@ class Advisor:
         for name, mesh in self.motion.shape.anatomy_ct.structures.items():
             middle_ct = mesh.vertices_mm.mean(0, keepdims=True)
             then = known.after(self._moves(middle_ct)[0], _LANDMARK_MM)
-            place_mm = self.motion.carry(middle_ct)[0]
+            place_mm = self.motion.forward(middle_ct)[0]
             yield self._entry("landmark", place_mm, np.zeros(3), known, then, name)
 
-    def looks(self) -> Iterator[NextEvidence]:
+    def views(self) -> Iterator[NextEvidence]:
         """From places about the camera's line of sight, at its distance."""
         places_mm, normals = self._surface()
         middle_mm, rows, known = places_mm.mean(0), self._rows(places_mm), self._known()
@@ -225,37 +225,40 @@ class Advisor:
             mine = rows[normals @ unit(towards) > _FACING]
             std_mm = self.config.sigma_mm * np.sqrt(max(len(mine), 1) / self.config.n_effective)
             then = known.after(mine, std_mm, len(CAMERA_STD))
-            yield self._entry("look", middle_mm + towards, -unit(towards), known, then)
+            yield self._entry("view", middle_mm + towards, -unit(towards), known, then)
 
     def _surface(self) -> tuple[Points, Points]:
         """Middles of some of the organ's triangles, and their normals."""
         organ = self.motion.shape.anatomy_ct.organ
         faces = organ.faces[:: max(1, len(organ.faces) // _PLACES)]
         used, numbers = np.unique(faces, return_inverse=True)
-        vertices_mm = self.motion.carry(organ.vertices_mm[used])
+        vertices_mm = self.motion.forward(organ.vertices_mm[used])
         places_mm, normals = triangles_of(vertices_mm, numbers.reshape(faces.shape))
         return places_mm, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
     def _known(self) -> _Known:
-        covariance, shares = self.motion.covariance, [share for _, share in self.motion.rivals]
+        covariance, shares = (
+            self.motion.covariance,
+            [share for _, share in self.motion.alternatives],
+        )
         assert covariance is not None
         middle = self._moves(self.motion.shape.middles_ct[[self.part]])[0]
         own = _Known(middle[:, : len(covariance)], self.motion.std_scale**2 * covariance)
         return replace(own.with_unknowns(np.array(shares)), middle=middle)
 
     def _moves(self, points_ct: Points) -> Float64[np.ndarray, "n 3 p"]:
-        here = self.motion.carry(points_ct)
+        here = self.motion.forward(points_ct)
         away = [
-            (rival.carry(points_ct) - here) @ self.motion.rotation
-            for rival, _ in self.motion.rivals
+            (alternative.forward(points_ct) - here) @ self.motion.rotation
+            for alternative, _ in self.motion.alternatives
         ]
         return np.concatenate([self.motion.effects(points_ct), *(a[:, :, None] for a in away)], 2)
 
     def _rows(self, places_mm: Points, part: int = 0) -> Float64[np.ndarray, "n p"]:
         rows = self.motion.residual_rows(places_mm, part).astype(float)
         others = [
-            rival.residual_rows(places_mm, part)[:, [-1]] - rows[:, [-1]]
-            for rival, _ in self.motion.rivals
+            alternative.residual_rows(places_mm, part)[:, [-1]] - rows[:, [-1]]
+            for alternative, _ in self.motion.alternatives
         ]
         return np.concatenate([rows[:, :-1], *others], axis=1)
 

@@ -3,7 +3,8 @@
 The logarithm of the bound is a sum of hinges of an answer's figures, with weights of 0 or more: no
 figure that gets worse makes an answer look better. They are the 95 % quantile of the largest miss
 of a part's points, fitted as such (pinball loss; Koenker and Bassett 1978, doi 10.2307/1913643), on
-simulated organs, physics, cameras and evidence (``lab/scripts/bounds.py``); none is a patient's.
+simulated organs, physics, cameras and evidence (``benchmarks/scripts/bounds.py``); none is a
+patient's.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ _NAME = "bounds.json"
 # of physics and kinds of evidence left out.
 POOR_MM = 6.0
 CONFIDENCE = 0.95
-_MOST_STRAYS, _FARTHEST_RIVAL_MM = 0.3, 10.0  # more say no more
+_MOST_OUTLIERS, _FARTHEST_ALTERNATIVE_MM = 0.3, 10.0  # more say no more
 _LEAST_HELD_MM = 0.05  # nor does less
 _WITHIN = 1.96  # standard deviations: 95 % of a normal distribution
 Hinges = dict[str, tuple[tuple[float, float], ...]]
@@ -69,20 +70,20 @@ def figures(report: FitReport, name: str) -> dict[str, float] | None:
     part, cost, motion = report.parts[name], report.fit_cost, report.motion
     if cost is None or motion is None or part.fit_std_mm is None:
         return None
-    if part.nearest_mm is None or part.held_by_prior_mm is None:
+    if part.nearest_mm is None or part.prior_pull_mm is None:
         return None
-    apart_mm = max((rival.apart_mm[name] for rival in cost.others), default=0.0)
+    distance_mm = max((alternative.distance_mm[name] for alternative in cost.others), default=0.0)
     return {
         "center_std": math.log(part.fit_std_mm[0]),
         "surface_std": math.log(part.fit_std_mm[1]),
         "nearest": math.log(max(part.nearest_mm, 1.0)),
-        "prior": math.log(max(part.held_by_prior_mm, _LEAST_HELD_MM)),
+        "prior": math.log(max(part.prior_pull_mm, _LEAST_HELD_MM)),
         "cost": math.log(max(cost.now / cost.usual, 0.1)),
-        "strays": min(cost.strays, _MOST_STRAYS),
-        "rarity": math.log1p(motion.rarity),
+        "outliers": min(cost.outliers, _MOST_OUTLIERS),
+        "normalized_mahalanobis": math.log1p(motion.normalized_mahalanobis),
         "compliance": math.log(motion.compliance_std_mm or 1.0),
         "misfit": math.log(max(motion.misfit_mm, _LEAST_HELD_MM)),
-        "rival": min(apart_mm, _FARTHEST_RIVAL_MM),
+        "alternative": min(distance_mm, _FARTHEST_ALTERNATIVE_MM),
         "size": math.log1p(max(report.size.gain, 0.0)) if report.size is not None else 0.0,
         "unseen": report.unseen or 0.0,
     }
@@ -116,12 +117,12 @@ def bound_mm(report: FitReport, name: str, share: float = 1.0) -> float | None:
 
 def alternatives_mm(report: FitReport, name: str) -> float:
     """How far off a part's centre is at most (95 %) by other fits that are as likely."""
-    rivals = () if report.fit_cost is None else report.fit_cost.others
+    alternatives = () if report.fit_cost is None else report.fit_cost.others
     left = 1 - CONFIDENCE
-    for rival in sorted(rivals, key=lambda rival: -rival.apart_mm[name]):
-        left -= rival.share
+    for alternative in sorted(alternatives, key=lambda alternative: -alternative.distance_mm[name]):
+        left -= alternative.share
         if left < 0:
-            return rival.apart_mm[name]
+            return alternative.distance_mm[name]
     return 0.0
 
 

@@ -32,7 +32,7 @@ class BoundFactor(Config, frozen=True):
         self.check_between(f"{NAME}:", factor=(0.01, 100))
 
     @property
-    def words(self) -> str:
+    def message(self) -> str:
         return (
             f"on {self.answers} scenes of known truth the bounds hold for 95 % when multiplied by "
             f"{self.factor:.2f}"

@@ -21,14 +21,14 @@ from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import Points, rotation_onto, transform_points, triangles_of
 from tumortrack.core.report import Cause, Check, Likely
 from tumortrack.core.tables import read_table
-from tumortrack.core.types import Look, Mesh, SensorCloud
+from tumortrack.core.types import Mesh, SensorCloud, View
 from tumortrack.core.units import Unit, likely_unit
 from tumortrack.registration.base_model import Model
 from tumortrack.registration.gauss_newton import refine
 from tumortrack.registration.in_distribution import spread_mm
-from tumortrack.registration.looks import Looks
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.multi_view import MultiViewCloud
 
 # By cause: what it is called, and what to do about it.
 _WORDS = read_table("tumortrack.assessment", "causes.toml", dict[str, tuple[str, str]])
@@ -53,7 +53,7 @@ _HELPED_BY_A_VIEW = Cause.HIDDEN, Cause.ANOTHER_PATIENT, Cause.VIEW
 # Hidden shares of the near side, and the points' spread relative to the near side's.
 _HIDDEN, _MOSTLY_HIDDEN, _SMALL_SPREAD = 0.15, 0.3, 0.8
 
-_OF_POSES = "none", "poses", "fit", "strays", "seen_through"  # checks that wrong poses fail
+_OF_POSES = "none", "poses", "fit", "outliers", "seen_through"  # checks that wrong poses fail
 _NOTHING_HIDES = 0.9  # of the organ's image is in sight; the rest has no return, as at its edges
 TOUCH_MORE = "touch more places, all over what can be reached of it"
 _MAX_SAMPLES = 2000  # faces of the organ that are looked at
@@ -61,38 +61,38 @@ _MIN_COSINE = 0.3  # to the line of sight: surfaces at a flatter angle return li
 _SEEN_WITHIN_MM = 8.0  # of an observed point
 _MAX_HIDDEN = 0.1  # share of the side that faces the camera
 _MIN_SINE = 0.3  # to the line of sight: below it, a direction is along the view
-Known = Mapping[str, tuple[Likely, ...]]
+TrackedEvidence = Mapping[str, tuple[Likely, ...]]
 
 
 def explained(
-    model: Model, looks: Sequence[Look], estimate: Estimate, known: Known
+    model: Model, views: Sequence[View], estimate: Estimate, known: TrackedEvidence
 ) -> tuple[tuple[Likely, ...], str]:
     """Causes of a poor estimate, and what probably happened and what to do, in words. ``known``:
     recent causes by failed check, which are not searched for again."""
-    causes = causes_of(model, looks, estimate, known)
-    alone = isinstance(looks[0].seen, SensorCloud) and not len(looks[0].seen.points_mm)
+    causes = causes_of(model, views, estimate, known)
+    alone = isinstance(views[0].full_view, SensorCloud) and not len(views[0].full_view.points_mm)
     # Touches hide nothing, and no camera can look elsewhere.
     in_sight = estimate.report.in_sight
     hides = not alone and (in_sight is None or in_sight < _NOTHING_HIDES)
     if not hides:
         causes = tuple(c for c in causes if c.cause is not Cause.HIDDEN) or (Likely(Cause.VIEW),)
-    view = TOUCH_MORE if alone else where_to_look(estimate, looks, hides)
+    view = TOUCH_MORE if alone else where_to_look(estimate, views, hides)
     return causes, words(causes, view)
 
 
 def causes_of(
-    model: Model, looks: Sequence[Look], estimate: Estimate | None, known: Known
+    model: Model, views: Sequence[View], estimate: Estimate | None, known: TrackedEvidence
 ) -> tuple[Likely, ...]:
     """With those that looks, evidence and frames before tell; None: there is no estimate."""
     check = check_of(estimate)
-    if len(looks) > 1 and check in _OF_POSES:
+    if len(views) > 1 and check in _OF_POSES:
         return (Likely(Cause.POSES),)
     pieces = () if estimate is None else estimate.report.evidence
     # The piece that lies the farthest from where the rest has it.
-    out = [(each.off_mm, number) for number, each in enumerate(pieces, 1) if each.left_out]
+    out = [(each.off_mm, number) for number, each in enumerate(pieces, 1) if each.rejected]
     wrong = (Likely(Cause.EVIDENCE, max(out)[1]),) if out else ()
     before = tuple(c for c in known.get(check, ()) if c.cause is not Cause.EVIDENCE)
-    return *wrong, *(before or likely_causes(model, looks[0].cloud, estimate))
+    return *wrong, *(before or likely_causes(model, views[0].cloud, estimate))
 
 
 def check_of(estimate: Estimate | None) -> str:
@@ -113,7 +113,7 @@ def likely_causes(
     """
     points = thin_cloud(cloud, _POINTS, np.random.default_rng(0)).points_mm.astype(float)
     fit = _fit(model, points) if estimate is None else _fit_of(estimate)
-    suspicious = fit.check in ("size", "strays", "seen_through") or fit.cost > _FITS
+    suspicious = fit.check in ("size", "outliers", "seen_through") or fit.cost > _FITS
     causes = [Likely(Cause.OBJECT)] if suspicious and _flat_or_round(points) else []
     if not causes and (suspicious or _off_axis(points, _BEYOND_CAMERAS)):
         causes = _by_trials(model, points, fit.cost)
@@ -145,20 +145,20 @@ def words(causes: tuple[Likely, ...], view: str) -> str:
 
 class _Fit(NamedTuple):
     """The organ on the points: its surface, the check that failed, and the cost relative to the
-    usual one, with and without strays. Without a surface nothing was fitted: the points are too
+    usual one, with and without outliers. Without a surface nothing was fitted: the points are too
     small or large for an organ."""
 
     organ: Mesh | None = None
     check: Check = "fit"
     cost: float = math.inf
-    without_strays: float = math.inf
+    without_outliers: float = math.inf
 
 
 def _fit_of(estimate: Estimate) -> _Fit:
     check = "other" if estimate.finding is None else estimate.finding.check
     if (cost := estimate.report.fit_cost) is None:
         return _Fit(estimate.organ_mesh, check, 0.0, 0.0)
-    costs = cost.now / cost.usual, cost.without_strays / cost.usual
+    costs = cost.now / cost.usual, cost.without_outliers / cost.usual
     return _Fit(estimate.organ_mesh, check, *costs)
 
 
@@ -167,12 +167,12 @@ def _fit(model: Model, points: Points) -> _Fit:
     least, most = model.in_distribution.spread_mm
     if not isinstance(model, RegistrationModel) or not least <= spread_mm(points) <= most:
         return _Fit()
-    looks = Looks.of([points])
-    starts = model.registration.search.starts(looks)[:_STARTS]
-    fits = [refine(model.shape, looks, start, model.config.refine) for start in starts]
+    views = MultiViewCloud.from_points([points])
+    starts = model.registration.search.starts(views)[:_STARTS]
+    fits = [refine(model.shape, views, start, model.config.refine) for start in starts]
     best, usual = min(fits, key=lambda fit: fit.cost), model.calibration.usual_cost
     organ = model.shape.anatomy_ct.organ
-    fitted = organ.moved(best.motion.carry(organ.vertices_mm))
+    fitted = organ.with_vertices(best.motion.forward(organ.vertices_mm))
     return _Fit(fitted, "fit", best.cost / usual, best.cost_without_strays / usual)
 
 
@@ -209,8 +209,8 @@ def _by_coverage(model: Model, points: Points, fit: _Fit) -> list[Likely]:
     background = float((_nearest_mm(points, organ.vertices_mm) > _BACKGROUND_MM).mean())
     hidden = float(_unseen(near, points).mean()) if len(near) else 0.0
     mostly = hidden > _MOSTLY_HIDDEN and spread_mm(points) < _SMALL_SPREAD * spread_mm(near)
-    fits_without = background > _BACKGROUND_SHARE and fit.without_strays < _FITS_WITHOUT
-    if check == "strays" or fits_without:
+    fits_without = background > _BACKGROUND_SHARE and fit.without_outliers < _FITS_WITHOUT
+    if check == "outliers" or fits_without:
         causes.append(Likely(Cause.BACKGROUND, background))
     if check == "unseen" or (hidden > _HIDDEN and check not in _NOT_THIS) or mostly:
         causes.append(Likely(Cause.HIDDEN, hidden))
@@ -249,20 +249,20 @@ def _off_axis(points: Points, cosine: float) -> bool:
     return bool(middle[2] < cosine * np.linalg.norm(middle))
 
 
-def where_to_look(estimate: Estimate, looks: Sequence[Look], hides: bool = True) -> str:
+def where_to_look(estimate: Estimate, views: Sequence[View], hides: bool = True) -> str:
     """The side of the organ that the camera should look at, in words. ``hides``: something may hide
     a part of it.
 
     If so, and if no view has points on more than a tenth of the side that faces the camera: that
-    part. Otherwise from where a look would tell most of the least sure tumor. Sides are those of
-    the first look's image.
+    part. Otherwise from where a view would tell most of the least sure tumor. Sides are those of
+    the first view's image.
     """
     organ = estimate.organ_mesh
     facing, centre = _near_side(organ), organ.vertices_mm.mean(0)
     points_mm = np.concatenate(
-        [transform_points(look.camera_from_look, look.cloud.points_mm) for look in looks]
+        [transform_points(view.camera_from_view, view.cloud.points_mm) for view in views]
     )
-    camera = "the first camera's" if len(looks) > 1 else "the camera's"
+    camera = "the first camera's" if len(views) > 1 else "the camera's"
     if hides and len(facing) and len(points_mm):
         hidden = _unseen(facing, points_mm)
         direction = facing[hidden].mean(0) - centre if hidden.mean() > _MAX_HIDDEN else np.zeros(3)
@@ -270,8 +270,8 @@ def where_to_look(estimate: Estimate, looks: Sequence[Look], hides: bool = True)
             return f"free the view of the organ's side towards {side}, or look from there"
     motion, report, best_mm = estimate.motion, estimate.report, np.zeros(3)  # the camera's own
     if isinstance(motion, ElasticMotion) and motion.covariance is not None and report.tumors:
-        advised = Advisor(motion, least_sure(report)).looks()
-        best_mm = np.array(min(advised, key=lambda look: look.then_std_mm).place_mm)
+        advised = Advisor(motion, least_sure(report)).views()
+        best_mm = np.array(min(advised, key=lambda view: view.then_std_mm).place_mm)
     side = _side_in_words(best_mm - centre, centre, camera)
     return f"look more from {side or 'another side'}, by about 30 degrees"
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.render import render_depth
-from tumortrack.core.types import DepthFrame, Intrinsics, Look, Mesh, SensorCloud
+from tumortrack.core.types import DepthFrame, Intrinsics, Mesh, SensorCloud, View
 
 _ON = 1 / 3  # of what is behind: on the surface
 _AGAINST = 3.0  # pixels that a pixel that is seen through outweighs
@@ -38,14 +38,14 @@ class Sight(NamedTuple):
     unseen: float | None = None
 
 
-def sight_of(estimate: Estimate, looks: Sequence[Look]) -> Sight:
+def sight_of(estimate: Estimate, views: Sequence[View]) -> Sight:
     images, clouds = [], []
-    views = _organ_before_cameras(estimate, looks)
-    for (organ, seen), look in zip(views, looks, strict=False):  # a network takes the first alone
+    pairs = _organ_before_cameras(estimate, views)
+    for (organ, seen), view in zip(pairs, views, strict=False):  # a network takes the first alone
         if isinstance(seen, DepthFrame):
-            images.append(seen_through(organ, seen, _behind_mm(look)))
+            images.append(seen_through(organ, seen, _behind_mm(view)))
         elif len(seen.points_mm):  # touches alone hide nothing, and are no scan
-            clouds.append(cloud_shares(organ, seen, _behind_mm(look)))
+            clouds.append(cloud_shares(organ, seen, _behind_mm(view)))
     by_depth = max((share for share, _, _ in images), default=0.0)
     return Sight(
         through=max(by_depth, *(share for share, _ in clouds), 0.0),
@@ -57,22 +57,22 @@ def sight_of(estimate: Estimate, looks: Sequence[Look]) -> Sight:
 
 
 def _organ_before_cameras(
-    estimate: Estimate, looks: Sequence[Look]
+    estimate: Estimate, views: Sequence[View]
 ) -> list[tuple[Mesh, DepthFrame | SensorCloud]]:
     """For each camera, the organ in its (corrected) frame, and all that it saw."""
-    organ, corrected = estimate.organ_mesh, estimate.report.looks
-    views = [(organ, looks[0].seen)]
+    organ, corrected = estimate.organ_mesh, estimate.report.views
+    pairs = [(organ, views[0].full_view)]
     if corrected is not None:
-        for look, pose in zip(looks[1:], corrected.camera_from_look[1:], strict=True):
-            look_from_camera = np.linalg.inv(np.array(pose))
-            vertices_mm = transform_points(look_from_camera, organ.vertices_mm)
-            views.append((organ.moved(vertices_mm), look.seen))
-    return views
+        for view, pose in zip(views[1:], corrected.camera_from_view[1:], strict=True):
+            view_from_camera = np.linalg.inv(np.array(pose))
+            vertices_mm = transform_points(view_from_camera, organ.vertices_mm)
+            pairs.append((organ.with_vertices(vertices_mm), view.full_view))
+    return pairs
 
 
-def _behind_mm(look: Look) -> float:
+def _behind_mm(view: View) -> float:
     """What lies so far behind the estimated surface is behind the organ, and no noise of it."""
-    measured_mm = 0.0 if look.cloud.noise is None else look.cloud.noise.measured_mm
+    measured_mm = 0.0 if view.cloud.noise is None else view.cloud.noise.measured_mm
     return float(np.hypot(_THROUGH_MM, _NOISES * measured_mm))
 
 
@@ -99,12 +99,12 @@ def seen_through(
     return float(through), float(rim_share), float(in_sight)
 
 
-def log_likelihood(organ: Mesh, look: Look) -> float:
-    """Log-likelihood of a look's depth image with the organ there, but for a constant and a factor:
+def log_likelihood(organ: Mesh, view: View) -> float:
+    """Log-likelihood of a view's depth image with the organ there, but for a constant and a factor:
     each pixel that shows its surface speaks for it, each that shows what it would hide against."""
-    assert isinstance(look.seen, DepthFrame)
-    seen_mm, organ_mm = _compared(organ, look.seen)
-    off_mm, behind_mm = seen_mm - organ_mm, _behind_mm(look)  # NaN where one shows nothing
+    assert isinstance(view.full_view, DepthFrame)
+    seen_mm, organ_mm = _compared(organ, view.full_view)
+    off_mm, behind_mm = seen_mm - organ_mm, _behind_mm(view)  # NaN where one shows nothing
     on, through = np.abs(off_mm) < _ON * behind_mm, off_mm > behind_mm
     return float(on.sum() - _AGAINST * through.sum())
 

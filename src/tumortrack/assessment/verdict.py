@@ -17,7 +17,7 @@ import numpy as np
 
 from tumortrack.assessment.advice import next_evidence
 from tumortrack.assessment.bound import POOR_MM, bounds_of, depths_within_mm
-from tumortrack.assessment.causes import Known, explained
+from tumortrack.assessment.causes import TrackedEvidence, explained
 from tumortrack.assessment.sight import Sight, sight_of
 from tumortrack.core.assessment import Assessment, ErrorBound, deciding
 from tumortrack.core.errors import NotThisOrgan
@@ -28,11 +28,11 @@ from tumortrack.core.report import (
     FitReport,
     Kind,
     Likely,
-    LooksReport,
     NextEvidence,
+    ViewsReport,
 )
-from tumortrack.core.types import Look
-from tumortrack.io.model_folder import weakness_of
+from tumortrack.core.types import View
+from tumortrack.io.model_folder import reliability_warning
 from tumortrack.registration.base_model import Model
 from tumortrack.registration.in_distribution import FIT_FACTOR, RIVAL_COST
 from tumortrack.registration.model import RegistrationModel
@@ -48,10 +48,10 @@ _LIMITS, _ROUGH_LIMITS = (0.05, 0.09), (0.1, 0.2)
 # sight now, unless the organ moved by more than this from one frame to the next.
 _AS_MUCH, _MOVED_MM = 0.9, 10.0
 # If the camera sees the surroundings in more than this share of a rim round the organ, most wrong
-# places are seen through. The fit is then judged without strays, and may cost ``FIT_FACTOR`` times
-# the usual cost.
+# places are seen through. The fit is then judged without outliers, and may cost ``FIT_FACTOR``
+# times the usual cost.
 _RIM_SHARE = 0.5
-_MAX_STRAYS = 0.5  # share of the points: the breakdown point of robust estimates
+_MAX_OUTLIERS = 0.5  # share of the points: the breakdown point of robust estimates
 _MAX_CAMERA_ERROR = 3.0  # standard deviations of a camera's pose
 _FAR_TILTED, _UPSIDE_DOWN = 60.0, 110.0  # degrees
 _MIN_PROBABILITY = 0.6  # mean over a tumor's points
@@ -60,13 +60,13 @@ _FEW, _MANY, _FOR_EACH = 3, 8, 5
 _MAX_UNSEEN = 0.1  # share of the organ's image without points of a cloud
 _OUTVOTED = 3  # later pieces at that place that agree with the answer, and so with each other
 _THERE_MM = 15.0  # from what the answer has there: how far apart touches of one spot may lie
-_OF_A_MOMENT = "held", "free"  # they say it again in each frame, as long as it is so
+_OF_A_MOMENT = "grasp", "free_space"  # they say it again in each frame, as long as it is so
 Advise = Literal["all", "touches", "nothing"]
 
 
 def judged(
     estimate: Estimate,
-    looks: Sequence[Look],
+    views: Sequence[View],
     strictly: bool = False,
     factor: float = 1.0,
     last: Estimate | None = None,
@@ -86,7 +86,7 @@ def judged(
         factor: by which the bounds are multiplied.
         last: of the frame before; a doubt about it may last.
     """
-    start_s, sight = time.perf_counter(), sight_of(estimate, looks)
+    start_s, sight = time.perf_counter(), sight_of(estimate, views)
     doubtful, impossible = _LIMITS if estimate.motion is not None else _ROUGH_LIMITS
     if sight.by_depth > impossible:
         raise NotThisOrgan(Finding("organ_seen_through", {"percent": 100 * sight.by_depth}))
@@ -112,9 +112,9 @@ def judged(
 
 def assessed(
     estimate: Estimate,
-    looks: Sequence[Look],
+    views: Sequence[View],
     model: Model,
-    known: Known = MappingProxyType({}),
+    known: TrackedEvidence = MappingProxyType({}),
     advise: Advise = "nothing",
     part: int | None = None,
 ) -> Estimate:
@@ -127,10 +127,10 @@ def assessed(
     """
     start_s, report, said = time.perf_counter(), estimate.report, estimate.assessment
     finding, causes, advice = said.finding, tuple[Likely, ...](), ""
-    if weakness := weakness_of(model.provenance):
-        finding = Finding("model", {"words": weakness})
+    if weakness := reliability_warning(model.provenance):
+        finding = Finding("model", {"message": weakness})
     elif finding is not None:
-        causes, advice = explained(model, looks, estimate, known)
+        causes, advice = explained(model, views, estimate, known)
     pays = tuple[NextEvidence, ...]()
     if isinstance(model, RegistrationModel) and advise != "nothing":
         pays = next_evidence(estimate, part, model.config.refine, advise == "touches")
@@ -172,7 +172,7 @@ def finding_of(
     """What makes an estimate poor; None: nothing does. ``doubtful``: share that is seen through."""
     if sight.through > doubtful:
         return Finding("seen_through", {"percent": 100 * sight.through})
-    finding = _misplaced_camera(report.looks)
+    finding = _misplaced_camera(report.views)
     finding = finding or _misfit(report, sight.rim > _RIM_SHARE and not strictly)
     finding = finding or _doubt(report, bounds)
     unseen = sight.unseen or 0.0
@@ -181,12 +181,12 @@ def finding_of(
     return finding
 
 
-def _misplaced_camera(looks: LooksReport | None) -> Finding | None:
+def _misplaced_camera(views: ViewsReport | None) -> Finding | None:
     """Whether a camera was found too far from its stated pose."""
-    if looks is None:
+    if views is None:
         return None
     most_mm, most_rad = _MAX_CAMERA_ERROR * CAMERA_STD[0], _MAX_CAMERA_ERROR * CAMERA_STD[-1]
-    errors = zip(looks.shift_mm, looks.turn_degrees, strict=True)
+    errors = zip(views.shift_mm, views.turn_degrees, strict=True)
     for view, (shift_mm, degrees) in enumerate(errors, start=1):
         if shift_mm > most_mm or degrees > np.rad2deg(most_rad):
             return Finding("poses", {"view": view, "shift_mm": shift_mm, "degrees": degrees})
@@ -194,13 +194,14 @@ def _misplaced_camera(looks: LooksReport | None) -> Finding | None:
 
 
 def _misfit(report: FitReport, surroundings_seen: bool) -> Finding | None:
-    """Too many strays, or too high a cost. ``surroundings_seen``: a wrong place is seen through."""
+    """Too many outliers, or too high a cost. ``surroundings_seen``: a wrong place is seen
+    through."""
     cost = report.fit_cost
     if cost is None:
         return None
-    if surroundings_seen and cost.strays > _MAX_STRAYS:
-        return Finding("strays", {"percent": 100 * cost.strays})
-    now, factor = (cost.without_strays, FIT_FACTOR) if surroundings_seen else (cost.now, 1.0)
+    if surroundings_seen and cost.outliers > _MAX_OUTLIERS:
+        return Finding("outliers", {"percent": 100 * cost.outliers})
+    now, factor = (cost.without_outliers, FIT_FACTOR) if surroundings_seen else (cost.now, 1.0)
     if now > factor * cost.usual:
         times = now / cost.usual
         return Finding("fit", {"times": times, "digits": _telling(times, factor)})
@@ -212,8 +213,8 @@ def _doubt(report: FitReport, bounds: Mapping[str, ErrorBound]) -> Finding | Non
     size, cost = report.size, report.fit_cost
     if size is not None and size.gain > RIVAL_COST:
         return Finding("size", {"times": size.times})
-    if cost is not None and cost.beyond is not None:
-        degrees = cost.beyond.tilt_degrees
+    if cost is not None and cost.excluded_pose is not None:
+        degrees = cost.excluded_pose.tilt_degrees
         turned: Kind = "tilted" if degrees > _FAR_TILTED else "not_turned"
         kind: Kind = "upside_down" if degrees > _UPSIDE_DOWN else turned
         return Finding(kind, {"degrees": degrees})
@@ -231,21 +232,21 @@ def _doubt(report: FitReport, bounds: Mapping[str, ErrorBound]) -> Finding | Non
     if 2 * depth_mm**2 > bound_mm**2:  # most of it
         return Finding("depths", {"depth_mm": depth_mm})
     about: dict[str, float | str | None] = {"part": name, "digits": _telling(bound_mm, POOR_MM)}
-    return Finding("miss", {**about, "miss_mm": bound_mm, "limit_mm": POOR_MM})
+    return Finding("miss", {**about, "error_bound95_mm": bound_mm, "limit_mm": POOR_MM})
 
 
 def _contradiction(evidence: Sequence[EvidenceReport]) -> Finding | None:
     """Evidence that was left out and decides: of earlier frames most of it, as the answer is rather
     wrong; of this one what a tool holds, or more than many that agree outvote."""
-    old = [each.left_out for each in evidence if each.before]
-    out = [not each.before and each.left_out for each in evidence]
+    old = [each.rejected for each in evidence if each.before]
+    out = [not each.before and each.rejected for each in evidence]
     agree = len(evidence) - len(old) - sum(out)
     outvoted = agree >= max(_MANY, _FOR_EACH * sum(out))
     most_old = len(old) >= _FEW and sum(old) > len(old) / 2
     wrong = [
         (each.off_mm, number, each.name)
         for number, each in enumerate(evidence, start=1)
-        if each.left_out and (most_old if each.before else not outvoted or each.name == "held")
+        if each.rejected and (most_old if each.before else not outvoted or each.name == "grasp")
     ]
     if not wrong:
         return None
@@ -268,9 +269,9 @@ def _deciding(report: FitReport, bounds: Mapping[str, ErrorBound]) -> Mapping[st
 def _unsure(report: FitReport) -> Finding | None:
     """Another fit that is as likely, or an uncertain part."""
     for other in () if report.fit_cost is None else report.fit_cost.others:
-        name, apart_mm = max(other.apart_mm.items(), key=lambda item: item[1])
-        if apart_mm > _MAX_UNCERTAINTY_MM:
-            return Finding("rival", {"part": name, "apart_mm": apart_mm})
+        name, distance_mm = max(other.distance_mm.items(), key=lambda item: item[1])
+        if distance_mm > _MAX_UNCERTAINTY_MM:
+            return Finding("alternative", {"part": name, "distance_mm": distance_mm})
     for name, part in report.parts.items():
         if part.center_std_mm is not None and part.center_std_mm > _MAX_UNCERTAINTY_MM:
             return Finding("unsure", {"part": name, "std_mm": part.center_std_mm})
@@ -305,13 +306,13 @@ class Disputes:
         new = [each for each in lasting if not each.before]
         for dispute in self._open:
             there_mm = _surface(estimate, dispute.part)[dispute.vertex]
-            agree = (each for each in new if not each.left_out)
+            agree = (each for each in new if not each.rejected)
             dispute.against += sum(_nearest(each, there_mm[None])[0] <= _THERE_MM for each in agree)
         self._open = [one for one in self._open if one.against < _OUTVOTED]
         old = [each for each in lasting if each.before]
-        wrong = sum(each.left_out for each in old) > len(old) / 2  # rather the answer than they
+        wrong = sum(each.rejected for each in old) > len(old) / 2  # rather the answer than they
         for each in (*new, *(old if wrong else ())):
-            if each.left_out:
+            if each.rejected:
                 vertex = _nearest(each, _surface(estimate, each.part))[1]
                 self._open.append(_Dispute(each.name, each.off_mm, each.part, vertex))
         if not self._open:

@@ -37,7 +37,7 @@ def segment_ct(
     organ_hu: tuple[float, float] = ORGAN_HU,
     tumor_hu: tuple[float, float] = TUMOR_HU,
     min_tumor_ml: float = MIN_TUMOR_ML,
-    kind: Organ = KIDNEY,
+    organ_kind: Organ = KIDNEY,
 ) -> tuple[LabelVolume, list[str]]:
     """Segment a phantom's CT by HU windows (half open, [low, high)), as in the paper: labels 1
     organ, 2, 3, ... tumors by volume, cropped to the organ; and notes.
@@ -56,7 +56,7 @@ def segment_ct(
     hu, affine = volume.hu, volume.lps_from_index
     solid = (hu >= organ_hu[0]) & (hu < tumor_hu[1])
     dense = (hu >= tumor_hu[0]) & (hu < tumor_hu[1])
-    organ = _find_organ(solid, dense, affine, kind)
+    organ = _find_organ(solid, dense, affine, organ_kind)
     everything_ml = float(solid.sum()) * voxel_ml(affine)
     box = bounding_box(organ, affine, _REACH_MM)
     affine = grids.moved_origin(affine, box)
@@ -135,7 +135,7 @@ class _Grid(NamedTuple):
 
 
 def _find_organ(
-    solid: np.ndarray, dense: np.ndarray, lps_from_index: np.ndarray, kind: Organ
+    solid: np.ndarray, dense: np.ndarray, lps_from_index: np.ndarray, organ_kind: Organ
 ) -> np.ndarray:
     """The voxels of ``solid`` in the one body like an organ; ``dense``: those in the tumor window.
 
@@ -146,13 +146,14 @@ def _find_organ(
     """
     factors = np.maximum(1, np.rint(_STEP_MM / spacing_mm(lps_from_index)).astype(int))
     coarse = lps_from_index @ np.diag([*factors, 1.0])
-    sizes = _KIDNEY_SIZES if kind.name == KIDNEY.name else _OTHER_SIZES
+    sizes = _KIDNEY_SIZES if organ_kind.name == KIDNEY.name else _OTHER_SIZES
     cells = _coarse(solid, factors), _coarse(dense, factors)
     grid = _Grid(*cells, coarse, spacing_mm(coarse), *sizes)
     region = _search(grid) if grid.solid.any() else None
     if region is None:
         raise InputError(
-            f"no free-standing {kind.words} was found in this CT: nothing between the HU limits is "
+            f"no free-standing {organ_kind.words} was found in this CT: nothing between the HU "
+            "limits is "
             f"compact, {grid.organ_ml[0]:g} to {grid.organ_ml[1]:g} ml and apart from its "
             "surroundings and from the image's end. Thresholds suit a phantom's CT; of a patient's "
             "CT segment the organ first and give the label map with --labels."

@@ -38,7 +38,7 @@ _RULE = (
 def read_meshes(
     paths: Sequence[Path],
     unit: str | None = None,
-    kind: Organ = KIDNEY,
+    organ_kind: Organ = KIDNEY,
     min_tumor_ml: float = MIN_TUMOR_ML,
 ) -> tuple[Anatomy, list[Note]]:
     """Read one organ and its tumors, LPS mm, from the meshes among files; and notes on every
@@ -49,7 +49,7 @@ def read_meshes(
     open or damaged meshes, wrong unit, a tumor apart from the organ."""
     if unit not in (None, "mm", "m"):
         raise InputError(f"unit {unit!r} is not allowed: mm or m.")
-    files = _files_by_name(paths, kind.name)
+    files = _files_by_name(paths, organ_kind.name)
     notes: list[Note] = []
     meshes = [read_lps(file, 1000.0 if unit == "m" else 1.0, notes) for file in files]
     _check_unit(files[0], meshes[0], unit)
@@ -61,7 +61,7 @@ def read_meshes(
         kept += [b for b in bodies[1:] if len(parts) and b.volume_ml >= min_tumor_ml]
         notes += _dropped(file.name, [body.volume_ml for body in bodies[len(kept) :]])
         first, last = len(parts), len(parts) + len(kept) - 1
-        names = part_names(last + 1, kind.name)
+        names = part_names(last + 1, organ_kind.name)
         notes.append(f"{file.name} is {' to '.join(dict.fromkeys([names[first], names[last]]))}")
         parts += kept
     if len(parts) - 1 > _MOST_TUMORS:
@@ -70,7 +70,7 @@ def read_meshes(
         parts[0] = _union(parts[0], tumor, f"tumor_{number}")
     if len(parts) == 1:
         notes.append("no tumor in these files")
-    return Anatomy(tuple(parts), kind), notes
+    return Anatomy(tuple(parts), organ_kind), notes
 
 
 def _dropped(name: str, pieces_ml: list[float]) -> list[Note]:
@@ -118,7 +118,7 @@ def read_lps(path: Path, scale: float, notes: list[Note]) -> Mesh:
         notes.append(f"{path.name} states SPACE=RAS: converted to LPS")
     elif space not in (None, "LPS"):
         raise InputError(f"{path} states SPACE={space}; LPS or RAS is allowed.")
-    return mesh.moved(vertices)
+    return mesh.with_vertices(vertices)
 
 
 def _stated_space(path: Path) -> str | None:
@@ -258,7 +258,7 @@ def _remesh(mesh: Mesh, name: str, step: float) -> Mesh:
 def is_simple(mesh: Mesh, step_mm: float) -> bool:
     """Whether rays along all three axes find only winding numbers 0 and 1."""
     for axis in range(3):
-        rolled = mesh.moved(np.roll(mesh.vertices_mm, axis, axis=1))
+        rolled = mesh.with_vertices(np.roll(mesh.vertices_mm, axis, axis=1))
         numbers = winding_numbers(rolled, *grid_round(rolled.box_mm, step_mm, 2 * step_mm))
         # Rounding may swap the faces of thin slivers: tolerate single rays.
         wrong = ((numbers < 0) | (numbers > 1)).any(2) | (numbers[:, :, -1] != 0)

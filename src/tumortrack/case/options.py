@@ -82,7 +82,7 @@ class PrepareOptions:
             raise InputError("--organ and --tumor name a label twice. Give each once.")
         if self.side not in (None, "left", "right"):
             raise InputError(f"side {self.side!r} is not allowed: left or right (the patient's).")
-        self.kind.check_side(self.side)
+        self.organ_kind.check_side(self.side)
         parse_structures(self.structure, self.name)
         direction_lps(self.up)
         if not 0 <= self.tilt <= _MOST_TILTED:
@@ -107,7 +107,7 @@ class PrepareOptions:
         return () if stated == (0,) else stated or None
 
     @property
-    def kind(self) -> Organ:
+    def organ_kind(self) -> Organ:
         return Organ(name=self.name, term=self.term)
 
     @property

@@ -41,7 +41,7 @@ from tumortrack.io.volume import (
     volume_of,
 )
 
-# Options for one kind of input only.
+# Options for one organ_kind of input only.
 _OF_CT, OF_LABELS = ("organ_hu", "tumor_hu"), ("labels", "organ", "tumor", "ct")
 _LEAST_ORGAN_OUTSIDE = 0.02  # of the outer surface
 _LARGEST_SHARE = 0.6  # of organ and tumors that one tumor may take without a note
@@ -82,7 +82,7 @@ def prepare(
             check_suffix(path)
         case = _from_meshes(files, options) if is_meshes else _from_volume(paths, files, options)
         _check_organ_outside(case.labels)
-        case = _noted(case, [*_large_tumors(case), *options.kind.doubts()])
+        case = _noted(case, [*_large_tumors(case), *options.organ_kind.doubts()])
         case = _with_structures(case, options)
         if options.ct is not None:
             case = _with_ct(case, options.ct)
@@ -165,7 +165,7 @@ def _large_tumors(case: Case) -> list[str]:
 
 
 def refuse_unused(what: str, options: PrepareOptions, *unused: str) -> None:
-    """Refuse options that this kind of input would ignore."""
+    """Refuse options that this organ_kind of input would ignore."""
     default = PrepareOptions()
     given = [name for name in unused if getattr(options, name) != getattr(default, name)]
     if given:
@@ -174,7 +174,7 @@ def refuse_unused(what: str, options: PrepareOptions, *unused: str) -> None:
 
 
 def _from_volume(paths: list[Path], files: list[Path], options: PrepareOptions) -> Case:
-    path, kind = paths[0], options.kind
+    path, organ_kind = paths[0], options.organ_kind
     if not path.is_dir():
         refuse_unused(f"{path} is one file", options, "series")
     raw = read_files(paths, files, options.series)
@@ -201,11 +201,11 @@ def _from_volume(paths: list[Path], files: list[Path], options: PrepareOptions) 
         volume = volume_of(raw, path)
         del raw
         windows = options.organ_hu, options.tumor_hu
-        labels, of_ct = segment_ct(volume, *windows, options.min_tumor_ml, kind)
+        labels, of_ct = segment_ct(volume, *windows, options.min_tumor_ml, organ_kind)
         ct, thickest_mm = crop_ct(volume, labels), float(spacing_mm(affine).max())
         notes += [*of_ct, *_where(thickest_mm > _THICK_MM, "thick", mm=thickest_mm)]
-    notes += _cut(kind.words, labels, shape, affine) or _flat(kind.words, labels)
-    anatomy, surface = surfaces(labels, kind)
+    notes += _cut(organ_kind.words, labels, shape, affine) or _flat(organ_kind.words, labels)
+    anatomy, surface = surfaces(labels, organ_kind)
     anatomy = replace(anatomy, structures=structures)
     columns = (surface[name] for name in ("names", "dropped_ml", "change_percent"))
     for part, ml, change in zip(*columns, strict=True):
@@ -216,14 +216,14 @@ def _from_volume(paths: list[Path], files: list[Path], options: PrepareOptions) 
                 "or hangs together by too little for a smooth surface. Look at qc.png"
             )
     measured = _measured(labels, anatomy, surface)
-    notes += _unusual(kind, measured)
+    notes += _unusual(organ_kind, measured)
     report = {"kind": "label map" if as_labels else "ct", "notes": notes, **measured}
     patient = patient_of(path, file_patient, options.patient, side)
     return Case(anatomy, labels, direction_lps(options.up), report, ct, patient)
 
 
-def _where(holds: bool, kind: Kind, **values: float | str) -> list[Finding]:
-    return [Finding(kind, values)] if holds else []
+def _where(holds: bool, organ_kind: Kind, **values: float | str) -> list[Finding]:
+    return [Finding(organ_kind, values)] if holds else []
 
 
 def _selected(
@@ -238,13 +238,13 @@ def _selected(
     if not (parts.names or options.organs) and (other := other_organ(path.name, options.name)):
         raise InputError(
             f"{path} is of a {other} by its name. Give --name {other}, or --organ NUMBER of the "
-            f"{options.kind.words}."
+            f"{options.organ_kind.words}."
         )
     others = [n for n in np.flatnonzero(counts).tolist() if n >= FIRST_TUMOR]
     used = organ, *(others if tumors is None else tumors)
     _check_every_slice(among(volume.labels, used), volume.lps_from_index, path)
     source, structures = split_structures(volume, parts.structures, organ)
-    selection = options.stated_side, organ, tumors, options.min_tumor_ml, options.kind
+    selection = options.stated_side, organ, tumors, options.min_tumor_ml, options.organ_kind
     chosen, notes, side = select_labels(source, *selection)
     around = _on_grid(source.labels, source.lps_from_index, chosen, 0)
     shares = neighbours(around, chosen.labels, used)
@@ -303,10 +303,10 @@ def _flat(name: str, labels: LabelVolume) -> list[Finding]:
     return _where(worst_mm2 > 0, "flat", part=name, area_cm2=worst_mm2 / 100)
 
 
-def _unusual(kind: Organ, measured: dict[str, Any]) -> list[Finding]:
-    low, high = _USUAL_ML.get(kind.name, (0.0, np.inf))
-    ml = measured["volumes_ml"][kind.name]
-    return _where(not low <= ml <= high, "volume", part=kind.words, ml=ml, low=low, high=high)
+def _unusual(organ_kind: Organ, measured: dict[str, Any]) -> list[Finding]:
+    low, high = _USUAL_ML.get(organ_kind.name, (0.0, np.inf))
+    ml = measured["volumes_ml"][organ_kind.name]
+    return _where(not low <= ml <= high, "volume", part=organ_kind.words, ml=ml, low=low, high=high)
 
 
 def patient_of(path: Path, in_file: Patient, identifier: str | None, side: Side) -> Patient:
@@ -323,11 +323,11 @@ def patient_of(path: Path, in_file: Patient, identifier: str | None, side: Side)
 def _from_meshes(files: list[Path], options: PrepareOptions) -> Case:
     unused = (*_OF_CT, *OF_LABELS[:-1], "series")
     refuse_unused(f"{files[0]} is a mesh", options, *unused)
-    anatomy, notes = read_meshes(files, options.unit, options.kind, options.min_tumor_ml)
+    anatomy, notes = read_meshes(files, options.unit, options.organ_kind, options.min_tumor_ml)
     labels = label_meshes(anatomy)
     mesh_ml = [part.volume_ml for part in anatomy.parts]
     measured = _measured(labels, anatomy, {"names": list(anatomy.names), "mesh_ml": mesh_ml})
-    notes += [*_flat(options.kind.words, labels), *_unusual(options.kind, measured)]
+    notes += [*_flat(options.organ_kind.words, labels), *_unusual(options.organ_kind, measured)]
     patient = Patient(options.patient or UNKNOWN, options.stated_side)
     report = {"kind": "meshes", "notes": notes, **measured}
     return Case(anatomy, labels, direction_lps(options.up), report, patient=patient)
@@ -341,7 +341,7 @@ def _measured(
     counts = np.bincount(labels.labels.ravel(), minlength=2) * voxel_ml(labels.lps_from_index)
     tumors = {f"tumor_{n - 1}": float(counts[n]) for n in range(2, len(counts))}
     return {
-        "volumes_ml": {anatomy.kind.name: float(counts[1:].sum()), **tumors},
+        "volumes_ml": {anatomy.organ_kind.name: float(counts[1:].sum()), **tumors},
         "surface": surface,
         "spacing_mm": spacing_mm(labels.lps_from_index).tolist(),
     }
@@ -359,7 +359,7 @@ def _with_ct(case: Case, path: Path) -> Case:
         raise InputError(f"--ct {path}: its voxels are not the labels'. Resample one of the two.")
     if case.patient.differs(raw.patient):
         raise InputError(f"--ct {path} is of {raw.patient}, the labels of {case.patient}.")
-    cut = _cut(case.anatomy.kind.words, case.labels, volume.hu.shape, volume.lps_from_index)
+    cut = _cut(case.anatomy.organ_kind.words, case.labels, volume.hu.shape, volume.lps_from_index)
     known = {note.kind for note in case.report["notes"] if isinstance(note, Finding)}
     case = replace(case, ct=crop_ct(volume, case.labels))
     return _noted(case, [] if "cut" in known else cut)

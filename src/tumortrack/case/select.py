@@ -60,7 +60,7 @@ def select_labels(
     organ: int = ORGAN,
     tumors: tuple[int, ...] | None = None,
     min_tumor_ml: float = MIN_TUMOR_ML,
-    kind: Organ = KIDNEY,
+    organ_kind: Organ = KIDNEY,
 ) -> tuple[LabelVolume, list[Note], Side]:
     """Keep one organ (label 1) and its tumors (2, 3, ...), cropped with a margin.
 
@@ -86,12 +86,12 @@ def select_labels(
     organs = _large_pieces(pieces)
     notes, apart = _attach_tumors(pieces, organs, min_tumor_ml)
     notes += _left_out(pieces, organs, apart, min_tumor_ml)
-    chosen, note, side = _choose(pieces, organs, side, float(middle[0]), kind)
+    chosen, note, side = _choose(pieces, organs, side, float(middle[0]), organ_kind)
     notes += [note] if note else []
     for n in set(organs) - {chosen}:
-        if not (kind.in_pairs and abs(pieces.x_mm(n) - pieces.x_mm(chosen)) > _PAIR_APART_MM):
+        if not (organ_kind.in_pairs and abs(pieces.x_mm(n) - pieces.x_mm(chosen)) > _PAIR_APART_MM):
             ml = float(pieces.whole_ml[n])
-            notes.append(Finding("dropped", {"what": kind.words, "ml": ml}))
+            notes.append(Finding("dropped", {"what": organ_kind.words, "ml": ml}))
     if not _MIN_ML <= (ml := pieces.whole_ml[chosen]) <= _MAX_ML:
         raise InputError(
             f"label {organ} and its tumors fill {ml:.1f} ml; an organ has "
@@ -237,7 +237,7 @@ def _left_out(
 
 
 def _choose(
-    pieces: _Pieces, organs: list[int], side: Side, middle_x_mm: float, kind: Organ
+    pieces: _Pieces, organs: list[int], side: Side, middle_x_mm: float, organ_kind: Organ
 ) -> tuple[int, str, Side]:
     """The number of the organ to keep, a note (may be empty), and its side."""
 
@@ -245,7 +245,7 @@ def _choose(
         return pieces.tumor_ml[number], pieces.whole_ml[number]
 
     best, alone = max(organs, key=tumor_then_size), len(organs) == 1
-    if not kind.in_pairs:
+    if not organ_kind.in_pairs:
         note = f"of {len(organs)} large pieces the one with most tumor, or the largest, was taken"
         return best, "" if alone else note, side
     if side == UNKNOWN and alone:
@@ -256,17 +256,18 @@ def _choose(
         middle_x_mm = (right_mm + left_mm) / 2
     if side == UNKNOWN:
         if pieces.tumor_ml[best] == 0:
-            what = f"{len(organs)} {kind.words}s and no tumor"
+            what = f"{len(organs)} {organ_kind.words}s and no tumor"
             raise InputError(f"the label map holds {what}. Give --side left or --side right.")
         side = "left" if x_mm[best] > middle_x_mm else "right"
-        note = f"the patient's {side} {kind.words} was chosen: it bears most tumor"
+        note = f"the patient's {side} {organ_kind.words} was chosen: it bears most tumor"
         return best, note, side if left_mm - right_mm > _PAIR_APART_MM else UNKNOWN
     # With one organ only the image's midline is known: near it, trust the user.
     slack, sign = _MIDLINE_MARGIN_MM if alone else 0.0, 1 if side == "left" else -1
     fitting = [n for n in organs if sign * (x_mm[n] - middle_x_mm) > -slack]
     if not fitting:
-        raise InputError(f"the {kind.words} lies on the patient's other side. Check --side.")
-    note = f"only one {kind.words} in the map; its side was checked against the image's middle only"
+        raise InputError(f"the {organ_kind.words} lies on the patient's other side. Check --side.")
+    what = organ_kind.words
+    note = f"only one {what} in the map; its side was checked against the image's middle only"
     return max(fitting, key=tumor_then_size), note if alone else "", side
 
 

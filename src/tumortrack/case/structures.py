@@ -122,7 +122,7 @@ def parts_of(raw: RawVolume, options: PrepareOptions, where: str) -> Parts:
     listing = ", ".join(f"{n} {name}" for n, name in names.items())
     if not organ:
         raise InputError(
-            f"{where} holds {listing}: none is a {options.kind.words} by name. Give --organ "
+            f"{where} holds {listing}: none is a {options.organ_kind.words} by name. Give --organ "
             "NUMBER, or --name of another organ."
         )
     check_side((names[n] for n in organ if n in names), options.stated_side)

@@ -28,7 +28,7 @@ _REPORTED += ["distance_mean_voxels", "distance_95_voxels", "distance_max_voxels
 
 
 def surfaces(
-    label_volume: LabelVolume, kind: Organ = KIDNEY
+    label_volume: LabelVolume, organ_kind: Organ = KIDNEY
 ) -> tuple[Anatomy, dict[str, list[Any]]]:
     """The organ's surface (all labels from 1 up) and one per tumor, LPS mm, faces outward; and a
     report: lists with an entry per part, ``names``, ``labels_ml``, ``mesh_ml``, ``change_percent``,
@@ -40,7 +40,7 @@ def surfaces(
     if top == 0:
         raise InputError("the labels are empty: no organ to take a surface of.")
     masks = [labels > 0, *(labels == n for n in range(FIRST_TUMOR, top + 1))]
-    names = part_names(len(masks), kind.name)
+    names = part_names(len(masks), organ_kind.name)
     # The grid step for about that number of triangles, 2.2 per cell face
     volume_mm3 = 1000 * float(masks[0].sum()) * voxel_ml(affine)
     area_mm2 = 1.35 * 4.836 * volume_mm3 ** (2 / 3)  # a kidney has 1.35 times a sphere's area
@@ -60,7 +60,7 @@ def surfaces(
         "dropped_ml": [round(mm3 / 1000, 4) for mm3 in dropped_mm3],
         **dict(zip(_REPORTED, columns, strict=True)),
     }
-    return Anatomy(tuple(parts), kind), report
+    return Anatomy(tuple(parts), organ_kind), report
 
 
 def surface_of(

@@ -59,7 +59,11 @@ class Prepare(PrepareOptions):
         words = ", ".join(map(str, inputs))
         with progress_of("the case's model", f"reading {words}, making surfaces ...") as made:
             from tumortrack import api
-            from tumortrack.io.model_folder import is_finished, read_model_manifest, weakness_of
+            from tumortrack.io.model_folder import (
+                is_finished,
+                read_model_manifest,
+                reliability_warning,
+            )
 
             case = api.prepare(
                 inputs, folder, overwrite=self.overwrite, segment=self.segment,
@@ -67,11 +71,11 @@ class Prepare(PrepareOptions):
             )  # fmt: skip
         model, weakness = folder / case.MODEL, ""
         if is_finished(model):
-            weakness = weakness_of(read_model_manifest(model)["provenance"])
-        notes = *(each.words for each in case.warnings), weakness, *case.report.get("notes", [])
+            weakness = reliability_warning(read_model_manifest(model)["provenance"])
+        notes = *(each.message for each in case.warnings), weakness, *case.report.get("notes", [])
         say_notes(filter(None, notes))
         say(str(case.patient))
-        kind = case.anatomy.kind
+        kind = case.anatomy.organ_kind
         if not kind.identified(case.patient):
             both = "both (--patient ID --side left|right): real arms need them"
             say_notes([f"state {both if kind.in_pairs else '--patient ID: real arms need it'}"])
@@ -156,7 +160,7 @@ class Evaluate:
             say_table(table)
         for line in (*conclusions(result["scenes"]), *headlines(result["summary"])):
             say(line)
-        if missing := result["rivals"].get("not_available"):
+        if missing := result["baselines"].get("not_available"):
             say(missing)
         say(f"written to {self.report / 'report.json'}; look at {self.report / 'index.html'}.")
 

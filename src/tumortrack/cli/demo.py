@@ -38,7 +38,7 @@ class Demo:
 
     out: Path = Path("runs/demo")
     scenes: int = 10
-    preset: Literal["clinic", "quick", "paper"] = "clinic"
+    preset: Literal["elastic", "quick", "paper"] = "elastic"
     minutes: float = 3.0
 
     def run(self) -> None:
@@ -48,7 +48,7 @@ class Demo:
 
         if not 0 < self.minutes < float("inf"):
             raise InputError(f"--minutes {self.minutes:g} must be more than 0.")
-        if self.preset != "clinic":
+        if self.preset != "elastic":
             from tumortrack.registration.method import method_of_preset
 
             method_of_preset(self.preset)  # what is missing is said first
@@ -72,7 +72,7 @@ class Demo:
         if "seconds" in first:  # located
             to_first_s = made_s + first["seconds"]
             say(f"labels to first estimate: {to_first_s:.0f} s, from the CT.")
-        if self.preset != "clinic":
+        if self.preset != "elastic":
             self._show_paper(report)
         say_table(scene_table(report["scenes"]))
         for line in conclusions(report["scenes"]):

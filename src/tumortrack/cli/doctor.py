@@ -41,8 +41,8 @@ PURPOSES = {
     ("tumortrack-resection", "arms"): "motions of two arms",
     ("tumortrack-resection", "ur"): "a real arm of Universal Robots",
     ("tumortrack-experiment", ""): "phantoms, calibrations, recordings",
-    ("tumortrack-lab", ""): "digital twin, studies, benchmarks",
-    ("tumortrack-lab", "fleet"): "many patients on many machines",
+    ("tumortrack-benchmarks", ""): "digital twin, studies, benchmarks",
+    ("tumortrack-benchmarks", "fleet"): "many patients on many machines",
 }
 _MODULES = {  # import names that differ from the package's
     "opencv-python-headless": "cv2",

@@ -101,16 +101,16 @@ def _say_estimate(estimate: Estimate, located: Located) -> None:
     say(str(estimate.patient))
     for row in part_rows(report, estimate.assessment):
         say(row_words(row))
-    agree = sum(not each.left_out for each in report.evidence)
+    agree = sum(not each.rejected for each in report.evidence)
     for number, each in enumerate(report.evidence, start=1):
-        if each.left_out or agree <= _MOST_SAID:
-            say(f"{each.name} {number}: {each.off_mm:.1f} mm off{', left out' * each.left_out}")
+        if each.rejected or agree <= _MOST_SAID:
+            say(f"{each.name} {number}: {each.off_mm:.1f} mm off{', left out' * each.rejected}")
     if agree > _MOST_SAID:
         say(f"{agree} pieces of evidence agree with the answer")
     for line in other_lines(estimate):
         say(line)
     for view in located.about["input"]:
-        say(view["words"])
+        say(view["message"])
     say_notes(located.about["notes"])
 
 

@@ -38,7 +38,7 @@ _MODULES = {  # in the order of --help; only the chosen command's is imported
 _DISTRIBUTIONS = {
     "onnx": "tumortrack-occupancy",
     **dict.fromkeys(("plan", "resect"), "tumortrack-resection"),
-    **dict.fromkeys(("twin", "bench", "fleet", "margins"), "tumortrack-lab"),
+    **dict.fromkeys(("twin", "bench", "fleet", "margins"), "tumortrack-benchmarks"),
     **dict.fromkeys(("phantom-kit", "calibrate", "record", "reference"), "tumortrack-experiment"),
 }
 _OBJECTS_PER_COLLECTION = 20_000

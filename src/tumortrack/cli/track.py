@@ -67,7 +67,7 @@ def follow(run: Session) -> None:
 
     say("warming up ...")
     run.loop.warm()
-    say_notes(weakness.words for weakness in run.tracker.model.warnings)
+    say_notes(weakness.message for weakness in run.tracker.model.warnings)
     screen = _Screen(run)
     with stopping(stop), ExitStack() as ending:
         ending.push(screen.end)

@@ -28,7 +28,7 @@ class Train:
     Attributes:
         case: folder that `prepare` wrote.
         model: folder to write.
-        preset: clinic registers the organ of the CT and learns nothing (default): a model of other
+        preset: elastic registers the organ of the CT and learns nothing (default): a model of other
             poses or another sensor than the case's. quick and paper label points by a network.
         rotations: how the organ may lie: turned about the line of sight and tilted, or in any way
             (default: as the case says; quick and paper: limited, tilts up to 15 degrees).
@@ -45,7 +45,7 @@ class Train:
 
     case: Positional[Path]
     model: Positional[Path]
-    preset: Literal["clinic", "quick", "paper"] = "clinic"
+    preset: Literal["elastic", "quick", "paper"] = "elastic"
     rotations: Literal["limited", "full"] | None = None
     sensor: Literal["d405", "stereo"] | None = None
     minutes: float | None = None
@@ -65,12 +65,12 @@ class Train:
             sensor=self.sensor, minutes=self.minutes, steps=self.steps, seed=self.seed,
             device=self.device, workers=self.workers, checkpoint_every_s=self.checkpoint_every,
         )  # fmt: skip
-        if self.preset == "clinic":
+        if self.preset == "elastic":
             self._make(train)
         elif folder.is_finished(self.model):
             done = train().provenance  # read, where it is of the same command
             say(f"{self.model} is trained already ({done['steps']} steps).")
-            say_notes(filter(None, [folder.weakness_of(done)]))
+            say_notes(filter(None, [folder.reliability_warning(done)]))
         else:
             self._train(train, case)
 
@@ -82,7 +82,7 @@ class Train:
         with progress_of("making the model") as progress:
             made = make(progress=progress)
         say(f"{self.model} holds the model: {folder.training_words(made.provenance)}.")
-        say_notes(filter(None, [folder.weakness_of(made.provenance)]))
+        say_notes(filter(None, [folder.reliability_warning(made.provenance)]))
 
     def _train(self, train: Callable[..., Model], case: Case) -> None:
         """A network."""
@@ -92,7 +92,7 @@ class Train:
         method_of_preset(self.preset)  # what is missing is said first
         say("starting ...")
         if case.anatomy.structures:
-            say_notes([f"{self.preset} knows no motion: structures are left out; clinic has them"])
+            say_notes([f"{self.preset} knows no motion: structures are left out; elastic has them"])
         last: TrainingStatus | None = None
 
         with live_line("making labelled points, starting workers ...") as show:
@@ -108,7 +108,7 @@ class Train:
         say(f"model written to {self.model}: {folder.training_words(about)}.")
         few = self.minutes is not None and last is not None and last.warming_up
         hint = "so few steps teach nearly nothing; train longer, or on a machine with less to do"
-        say_notes(filter(None, [hint if few else "", folder.weakness_of(about)]))
+        say_notes(filter(None, [hint if few else "", folder.reliability_warning(about)]))
 
 
 def _progress(status: TrainingStatus) -> str:

@@ -25,7 +25,7 @@ class ErrorBound(msgspec.Struct, frozen=True):
     least_sure: Point | None = None
 
     @property
-    def words(self) -> str:
+    def message(self) -> str:
         return f"off by at most {self.error_bound95_mm:.1f} mm (95 %)"
 
 
@@ -56,7 +56,7 @@ class Assessment(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def reason(self) -> str:
         """Why it is poor and what to do; empty: it is good."""
-        return "" if self.finding is None else self.finding.words + for_caller(self.advice)
+        return "" if self.finding is None else self.finding.message + for_caller(self.advice)
 
     @property
     def factor_words(self) -> str:
@@ -69,7 +69,7 @@ class Assessment(msgspec.Struct, frozen=True, kw_only=True):
 
     def bound_words(self, part: str) -> str:
         """How far off a part is at most; empty: not known, or the answer is poor."""
-        return self.shown[part].words if part in self.shown else ""
+        return self.shown[part].message if part in self.shown else ""
 
 
 def deciding(bounds: Mapping[str, ErrorBound]) -> Mapping[str, ErrorBound]:
@@ -79,11 +79,11 @@ def deciding(bounds: Mapping[str, ErrorBound]) -> Mapping[str, ErrorBound]:
 
 def bound_words(bounds: Mapping[str, ErrorBound]) -> str:
     """How far off the tumors are at most, or else the organ; empty: not known."""
-    return ", ".join(f"{name} {bound.words}" for name, bound in deciding(bounds).items())
+    return ", ".join(f"{name} {bound.message}" for name, bound in deciding(bounds).items())
 
 
 def centre_label(name: str, bounds: Mapping[str, ErrorBound], poor: bool) -> str:
     """A tumor's name, and how far off it is at most as far as that is known."""
     if poor:
         return f"{name} POOR"
-    return f"{name}, {bounds[name].words}" if name in bounds else name
+    return f"{name}, {bounds[name].message}" if name in bounds else name

@@ -67,5 +67,5 @@ def findings_in(entries: object, where: str) -> tuple[Finding, ...]:
     """Likewise of findings; none: of a version that knew none."""
     with readable(where, "has findings that are none of this version"):
         found = msgspec.convert(entries or (), tuple[Finding, ...])
-        _ = [finding.words for finding in found]  # their values are there
+        _ = [finding.message for finding in found]  # their values are there
     return found

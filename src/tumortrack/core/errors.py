@@ -71,7 +71,7 @@ class NoEstimate(TumortrackError):
         self, reason: str | Finding, causes: tuple[Likely, ...] = (), advice: str = ""
     ) -> None:
         self.finding = None if isinstance(reason, str) else reason
-        super().__init__((reason if isinstance(reason, str) else reason.words) + advice)
+        super().__init__((reason if isinstance(reason, str) else reason.message) + advice)
         self.causes = causes
 
 

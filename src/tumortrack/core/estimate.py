@@ -43,14 +43,14 @@ class Motion(Protocol):
     """One frame's correspondence: undeformed CT (LPS, mm) <-> camera frame (mm). Any finite points,
     n x 3, are allowed, also outside the organ, and give finite ones; InputError for others."""
 
-    def carry(self, points_ct: Points, /) -> Points:
+    def forward(self, points_ct: Points, /) -> Points:
         """From the CT to the camera frame."""
 
-    def back(self, points_camera: Points, /) -> Points | None:
-        """From the camera frame to the undeformed CT; None if the method has only ``carry``."""
+    def inverse(self, points_camera: Points, /) -> Points | None:
+        """From the camera frame to the undeformed CT; None if the method has only ``forward``."""
 
     def std_mm(self, points_ct: Points, /) -> Float[np.ndarray, " n"] | None:
-        """Uncertainty of ``carry``: one standard deviation, root mean square of the three axes;
+        """Uncertainty of ``forward``: one standard deviation, root mean square of the three axes;
         None if the method does not know it."""
 
     def largest_std_mm(self, points_ct: Points, /) -> Float[np.ndarray, " n"] | None:
@@ -82,16 +82,16 @@ class Parts(dict[str, LocatedPart]):
 
 
 class FollowOptions(Config, frozen=True, kw_only=True):
-    """How to locate a frame of a sequence. ``thorough``: also search independently of the last
+    """How to locate a frame of a sequence. ``global_search``: also search independently of the last
     estimate and keep the better fit, as a search near the last one would keep its error.
-    ``either_side``: the organ may have been turned over. ``smoothing_s``: time constant of the mean
+    ``allow_flip``: the organ may have been turned over. ``smoothing_s``: time constant of the mean
     over past estimates; 0: none. ``known``: recent causes by failed check (``none``: no estimate),
     which are not searched for again. ``evidence``: what became known with this frame, in its camera
     frame; what was known before is in the last estimate, or, where there is none, in ``earlier``
     (as in ``Estimate.evidence``)."""
 
-    thorough: bool = False
-    either_side: bool = False
+    global_search: bool = False
+    allow_flip: bool = False
     smoothing_s: float = 0.0
     seed: int = 0
     known: dict[str, tuple[Likely, ...]] = msgspec.field(default_factory=dict)
@@ -155,7 +155,7 @@ class Estimate:
         overwrite: bool = False,
         *,
         cloud: SensorCloud | None = None,
-        seen: DepthFrame | SensorCloud | None = None,
+        full_view: DepthFrame | SensorCloud | None = None,
     ) -> None:
         """Write what `tumortrack locate` writes: points, labelled volume, surfaces, report, and a
         page to look at (index.html, picture.png). Raises InputError: the folder exists and
@@ -164,19 +164,19 @@ class Estimate:
 
         Args:
             cloud: the organ's points, in which it was located, for the page.
-            seen: all that the camera saw, likewise.
+            full_view: all that the camera saw, likewise.
         """
-        _located(self, cloud, seen).save(folder, overwrite)
+        _located(self, cloud, full_view).save(folder, overwrite)
 
     def show(
         self,
         *,
         cloud: SensorCloud | None = None,
-        seen: DepthFrame | SensorCloud | None = None,
+        full_view: DepthFrame | SensorCloud | None = None,
     ) -> None:
         """Show that page: within a notebook, else in the browser. Where there is no display, print
         where the page is: in a folder for temporary files. Arguments as of ``save``."""
-        _located(self, cloud, seen).show()
+        _located(self, cloud, full_view).show()
 
     @property
     def finding(self) -> Finding | None:
@@ -229,11 +229,11 @@ class Estimate:
     def forward(self, points_ct: Points) -> Points:
         """Points of the CT (n, 3; LPS, mm), also outside the organ, in the camera frame. Raises
         InputError: the method knows no motion, or they are no finite points."""
-        return self._known_motion().carry(points_ct)
+        return self._known_motion().forward(points_ct)
 
     def inverse(self, points_camera: Points) -> Points:
         """Points of the camera frame (n, 3; mm) in the CT. Raises InputError as ``forward``."""
-        back = self._known_motion().back(points_camera)
+        back = self._known_motion().inverse(points_camera)
         if back is None:
             raise InputError("this method knows its motion in one direction alone.")
         return back
@@ -260,9 +260,9 @@ class Estimate:
 
 
 def _located(
-    estimate: Estimate, cloud: SensorCloud | None, seen: DepthFrame | SensorCloud | None
+    estimate: Estimate, cloud: SensorCloud | None, full_view: DepthFrame | SensorCloud | None
 ) -> Any:
     """As `locate` writes and shows it. Files and pages lie in packages above this one, so they are
     loaded by name, when a user asks for them."""
     located = import_module("tumortrack.report.locating")
-    return located.Located(estimate, seen=located.Seen(cloud, seen))
+    return located.Located(estimate, seen=located.Seen(cloud, full_view))

@@ -98,7 +98,7 @@ class Landmark(_Evidence, frozen=True, kw_only=True, tag="landmark"):
     std_mm: float = 2.0
 
 
-class Held(_Evidence, frozen=True, kw_only=True, tag="held"):
+class Grasp(_Evidence, frozen=True, kw_only=True, tag="grasp"):
     """A point of the CT (LPS, mm) that a tool holds, which is at a place by now. ``point_std_mm``:
     of which point it is, as the estimate had it when the tool took it. If both are known through
     one calibration, its error cancels: state no ``shared_std_mm``."""
@@ -117,7 +117,7 @@ class Outline(_Evidence, frozen=True, kw_only=True, tag="outline"):
     std_mm: float = 1.0
 
 
-class Free(_Evidence, frozen=True, kw_only=True, tag="free"):
+class FreeSpace(_Evidence, frozen=True, kw_only=True, tag="free_space"):
     """Places without tissue, as along the shaft of a tool, which has the radius ``tip_mm``."""
 
     places_mm: tuple[Point, ...]
@@ -125,7 +125,7 @@ class Free(_Evidence, frozen=True, kw_only=True, tag="free"):
     std_mm: float = 1.0
 
 
-Evidence: TypeAlias = Touch | Landmark | Held | Outline | Free
+Evidence: TypeAlias = Touch | Landmark | Grasp | Outline | FreeSpace
 
 
 def _tuples(places: np.ndarray) -> Any:

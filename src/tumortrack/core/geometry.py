@@ -27,8 +27,8 @@ DIRECTIONS_LPS: dict[str, Direction] = {
     "inferior": (0.0, 0.0, -1.0),
 }
 
-HERE = np.eye(4)  # both frames are the same
-HERE.flags.writeable = False
+IDENTITY = np.eye(4)  # both frames are the same
+IDENTITY.flags.writeable = False
 _NOT_RIGID = 1e-3  # deviation of a rotation from orthonormal: files have few digits
 _FARTHEST_MM = 5000.0  # beyond any arm, tracker or camera of one room
 

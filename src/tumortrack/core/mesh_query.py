@@ -144,4 +144,4 @@ def rough_margin(part: Mesh, margin_mm: float) -> Mesh:
     normals = np.zeros_like(part.vertices_mm)
     np.add.at(normals, part.faces.ravel(), np.repeat(weighted, 3, axis=0))
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    return part.moved(part.vertices_mm + margin_mm * normals)
+    return part.with_vertices(part.vertices_mm + margin_mm * normals)

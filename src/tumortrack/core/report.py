@@ -19,10 +19,11 @@ Point = tuple[float, float, float]
 
 # Which check an estimate failed; other: of a moment, or the model. none: no estimate.
 Check = Literal[
-    "poses", "fit", "strays", "seen_through", "unseen", "size", "place", "other", "none"
+    "poses", "fit", "outliers", "seen_through", "unseen", "size", "place", "other", "none"
 ]
 Kind = Literal[
-    "not_judged", "poses", "strays", "fit", "size", "upside_down", "tilted", "not_turned", "rival",
+    "not_judged", "poses", "outliers", "fit", "size", "upside_down", "tilted", "not_turned",
+    "alternative",
     "missing", "unsure", "miss", "depths", "improbable", "seen_through", "unseen", "hidden_now",
     "evidence", "disputed", "model", "frame_in_doubt", "good_again",
     # No estimate: the frame or its source.
@@ -51,8 +52,10 @@ class _Said(msgspec.Struct, forbid_unknown_fields=True):
     case: dict[Kind, str]
 
 
-_SAID = read_table("tumortrack.core", "findings.toml", _Said)
-_SENTENCES = {kind: said for kind, (_, said) in _SAID.poor.items()} | _SAID.none | _SAID.case
+_MESSAGES = read_table("tumortrack.core", "findings.toml", _Said)
+_SENTENCES = (
+    {kind: said for kind, (_, said) in _MESSAGES.poor.items()} | _MESSAGES.none | _MESSAGES.case
+)
 
 
 class _WithoutNumbers(string.Formatter):
@@ -71,10 +74,10 @@ class Finding(msgspec.Struct, Renamed, frozen=True):
 
     @property
     def check(self) -> Check:
-        return _SAID.poor[self.kind][0] if self.kind in _SAID.poor else "none"
+        return _MESSAGES.poor[self.kind][0] if self.kind in _MESSAGES.poor else "none"
 
     @property
-    def words(self) -> str:
+    def message(self) -> str:
         return for_caller(_SENTENCES[self.kind].format(**self.values))
 
     @property
@@ -85,7 +88,7 @@ class Finding(msgspec.Struct, Renamed, frozen=True):
     @property
     def same_as(self) -> tuple[Kind, object]:
         """Equal for what is the same but for its numbers: the kind, and what was said in words."""
-        return self.kind, self.values.get("words")
+        return self.kind, self.values.get("message")
 
 
 Note = str | Finding  # of how a case was made: in passing, or a weakness
@@ -99,7 +102,7 @@ class PartReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     """One part, camera frame. ``points``: of the labelled cloud, with their mean ``probability``;
     ``center_axes``: unit vectors along which the centre has the deviations
     ``center_axes_std_mm``, the least sure first; ``nearest_mm``: from the centre to the nearest
-    point that was seen or is known; ``held_by_prior_mm``: how far the elastic prior, against the
+    point that was seen or is known; ``prior_pull_mm``: how far the elastic prior, against the
     points, holds the centre; ``fit_std_mm``: the largest deviations of centre and surface without
     the camera's common error. None: not found, or the method does not know."""
 
@@ -115,7 +118,7 @@ class PartReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     center_axes: tuple[Point, Point, Point] | None = None
     surface_std_mm: float | None = None
     nearest_mm: float | None = None
-    held_by_prior_mm: float | None = None
+    prior_pull_mm: float | None = None
     fit_std_mm: tuple[float, float] | None = None
 
 
@@ -126,18 +129,19 @@ class Residuals(_Value, frozen=True, kw_only=True):
     p95: float
 
 
-class RivalFit(_Value, frozen=True, kw_only=True):
-    """Another fit, which costs ``more``, and has this ``share`` of the probability; ``apart_mm``:
-    how far off the parts' middles lie in it, at ``center_mm``, with the organ turned by so much."""
+class AlternativeFit(_Value, frozen=True, kw_only=True):
+    """Another fit, which costs ``more``, and has this ``share`` of the probability;
+    ``distance_mm``: how far off the parts' middles lie in it, at ``center_mm``, with the organ
+    turned by so much."""
 
     more: float
-    apart_mm: dict[str, float]
+    distance_mm: dict[str, float]
     center_mm: dict[str, Point] = {}
     turn_degrees: float = 0.0
     share: float = 0.0
 
     @property
-    def words(self) -> str:
+    def message(self) -> str:
         places = (
             f"{n} at ({x:.1f}, {y:.1f}, {z:.1f}) mm" for n, (x, y, z) in self.center_mm.items()
         )
@@ -153,15 +157,15 @@ class ExcludedFit(_Value, frozen=True, kw_only=True):
 
 
 class FitCost(_Value, frozen=True, kw_only=True):
-    """Cost ``now``, and ``without_strays``, beside the ``usual`` one of validation scenes;
-    ``strays``: share of the points."""
+    """Cost ``now``, and ``without_outliers``, beside the ``usual`` one of validation scenes;
+    ``outliers``: share of the points."""
 
     now: float
-    without_strays: float
+    without_outliers: float
     usual: float
-    strays: float
-    others: tuple[RivalFit, ...] = ()
-    beyond: ExcludedFit | None = None
+    outliers: float
+    others: tuple[AlternativeFit, ...] = ()
+    excluded_pose: ExcludedFit | None = None
 
 
 class SizeFit(_Value, frozen=True, kw_only=True):
@@ -179,24 +183,24 @@ class SmoothingReport(_Value, frozen=True, kw_only=True):
     lag_ms: float = 0.0
 
 
-class LooksReport(_Value, frozen=True, kw_only=True):
-    """Of several looks: where each camera was, and how far from where its pose says."""
+class ViewsReport(_Value, frozen=True, kw_only=True):
+    """Of several views: where each camera was, and how far from where its pose says."""
 
-    camera_from_look: tuple[tuple[tuple[float, ...], ...], ...]
+    camera_from_view: tuple[tuple[tuple[float, ...], ...], ...]
     shift_mm: tuple[float, ...]
     turn_degrees: tuple[float, ...]
 
 
 class EvidenceReport(_Value, frozen=True, kw_only=True):
     """One piece of evidence: its kind, part, tool and deviation; how far it lies from the answer at
-    most, and which share of what it says is news beside all else (0 to 1). ``left_out``: it
-    contradicts the rest; ``before``: it is of an earlier frame; ``places_mm``: by now, camera
-    frame."""
+    most, and which share of what it says is information_gain beside all else (0 to 1).
+    ``rejected``: it contradicts the rest; ``before``: it is of an earlier frame; ``places_mm``: by
+    now, camera frame."""
 
     name: str
     off_mm: float
-    news: float
-    left_out: bool
+    information_gain: float
+    rejected: bool
     part: str = ""
     tool: str = ""
     std_mm: float | None = None
@@ -208,9 +212,9 @@ class NextEvidence(_Value, frozen=True, kw_only=True):
     """What to learn next of a part, and what one standard deviation of its middle along its least
     sure axis, and its bound, are and would be ``then``. ``place_mm`` and ``direction`` (unit), by
     kind: of a touch on the organ, with the surface's normal; an outline's middle, with its plane's
-    normal; a landmark (``name``: the structure); a look: the camera's place and line of sight."""
+    normal; a landmark (``name``: the structure); a view: the camera's place and line of sight."""
 
-    kind: Literal["touch", "outline", "landmark", "look"]
+    kind: Literal["touch", "outline", "landmark", "view"]
     part: str
     place_mm: Point
     direction: Point
@@ -221,14 +225,14 @@ class NextEvidence(_Value, frozen=True, kw_only=True):
     name: str = ""
 
     @property
-    def words(self) -> str:
+    def message(self) -> str:
         x, y, z = (f"{value:.0f}" for value in self.place_mm)
         axis = "xyz"[max(range(3), key=lambda axis: abs(self.direction[axis]))]
         what = {
             "touch": f"touch the organ at {x}, {y}, {z} mm",
             "outline": f"outline {self.part} across {axis}",
             "landmark": f"point at {self.name}",
-            "look": f"look from {x}, {y}, {z} mm as well",
+            "view": f"look from {x}, {y}, {z} mm as well",
         }[self.kind]
         if self.bound_mm is None or self.then_bound_mm is None:
             return what
@@ -241,18 +245,19 @@ class AllowedPoses(_Value, frozen=True, kw_only=True):
 
     up_lps: Point
     tilt_degrees: float
-    either_side: bool
+    allow_flip: bool
 
 
 class MotionReport(_Value, frozen=True, kw_only=True):
-    """The fitted motion: pose, elastic ``coefficients``, Gauss-Newton ``steps``. ``rarity``: of the
-    library's state; ``compliance_std_mm``: of the compliance, whose coefficients are the last;
-    ``misfit_mm``: what the library leaves of groups of neighbouring points, root mean square;
-    ``depth_share``: standard deviation of the camera's depths, all alike, as a share of them."""
+    """The fitted motion: pose, elastic ``coefficients``, Gauss-Newton ``steps``.
+    ``normalized_mahalanobis``: of the library's state; ``compliance_std_mm``: of the compliance,
+    whose coefficients are the last; ``misfit_mm``: what the library leaves of groups of
+    neighbouring points, root mean square; ``depth_share``: standard deviation of the camera's
+    depths, all alike, as a share of them."""
 
     camera_from_ct: tuple[tuple[float, float, float, float], ...]
     coefficients: tuple[float, ...]
-    rarity: float
+    normalized_mahalanobis: float
     steps: int
     compliance_std_mm: float | None
     misfit_mm: float
@@ -260,7 +265,7 @@ class MotionReport(_Value, frozen=True, kw_only=True):
 
 
 class ScanReport(_Value, frozen=True, kw_only=True):
-    """How far off the least sure tumor is at most (95 %) with one look, two, ...; without one, the
+    """How far off the least sure tumor is at most (95 %) with one view, two, ...; without one, the
     organ."""
 
     error_bound95_mm: tuple[float, ...]
@@ -290,7 +295,7 @@ class FitReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     fit_cost: FitCost | None = None
     poses: AllowedPoses | None = None
     motion: MotionReport | None = None
-    looks: LooksReport | None = None
+    views: ViewsReport | None = None
     evidence: tuple[EvidenceReport, ...] = ()
     fit_mm: Residuals | None = None
     timings: dict[str, float] = {}

@@ -145,7 +145,7 @@ class Mesh(Renamed):
         edges = np.sort(np.concatenate([self.faces[:, [n, (n + 1) % 3]] for n in range(3)]), axis=1)
         return not (np.unique(edges, axis=0, return_counts=True)[1] % 2).any()
 
-    def moved(self, vertices_mm: Float[np.ndarray, "v 3"]) -> Mesh:
+    def with_vertices(self, vertices_mm: Float[np.ndarray, "v 3"]) -> Mesh:
         """The same triangles with other vertices (a deformation or a change of frame)."""
         return Mesh(vertices_mm, self.faces)
 
@@ -157,7 +157,7 @@ class Anatomy(Renamed):
     organ, closed or open."""
 
     parts: tuple[Mesh, ...]
-    kind: Organ = KIDNEY
+    organ_kind: Organ = KIDNEY
     structures: Mapping[str, Mesh] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -167,7 +167,7 @@ class Anatomy(Renamed):
     @property
     def names(self) -> tuple[str, ...]:
         """See ``part_names``; mesh files have these names, too."""
-        return part_names(len(self.parts), self.kind.name)
+        return part_names(len(self.parts), self.organ_kind.name)
 
     @cached_property
     def closed(self) -> Mapping[str, Mesh]:
@@ -175,9 +175,9 @@ class Anatomy(Renamed):
         parts = dict(zip(self.names, self.parts, strict=True))
         return parts | {name: mesh for name, mesh in self.structures.items() if mesh.closed}
 
-    def of(self, parts: Iterable[Mesh]) -> Anatomy:
+    def with_parts(self, parts: Iterable[Mesh]) -> Anatomy:
         """The same organ with other surfaces, and no structures."""
-        return Anatomy(tuple(parts), self.kind)
+        return Anatomy(tuple(parts), self.organ_kind)
 
     @property
     def organ(self) -> Mesh:
@@ -249,7 +249,7 @@ class DepthFrame:
 
 class PointNoise(NamedTuple):
     """Standard deviations, mm, along the line of sight: of what was measured; of a point, of which
-    neighbours' white noise may be averaged away; of the mean of all points of a look, as what
+    neighbours' white noise may be averaged away; of the mean of all points of a view, as what
     neighbours share does not average out; and of a shift of all points, along any axis."""
 
     measured_mm: float = 0.0
@@ -284,16 +284,16 @@ class SensorCloud:
 
 
 @dataclass(frozen=True, eq=False)
-class Look(Renamed):
+class View(Renamed):
     """The organ seen by another camera or from another place: its points, ``cloud``, and all that
-    was ``seen``, in that camera's frame; ``camera_from_look`` leads to the first camera's."""
+    was ``seen``, in that camera's frame; ``camera_from_view`` leads to the first camera's."""
 
     cloud: SensorCloud
-    seen: DepthFrame | SensorCloud
-    camera_from_look: Float64[np.ndarray, "4 4"]
+    full_view: DepthFrame | SensorCloud
+    camera_from_view: Float64[np.ndarray, "4 4"]
 
     def __post_init__(self) -> None:
-        _freeze(self, "camera_from_look", np.float64, (4, 4))
+        _freeze(self, "camera_from_view", np.float64, (4, 4))
 
 
 @dataclass(frozen=True, eq=False)

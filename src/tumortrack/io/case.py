@@ -80,7 +80,7 @@ def save_case(case: Case, folder: Path) -> None:
     if case.ct is not None:
         write_volume_nifti(folder / "ct.nii.gz", case.ct.hu, case.ct.lps_from_index)
     content = {
-        "organ": organ_entry(case.anatomy.kind),
+        "organ": organ_entry(case.anatomy.organ_kind),
         "structures": list(case.anatomy.structures),
         "parts": list(case.anatomy.names),
         "up_lps": [float(x) for x in case.up_lps],

@@ -65,7 +65,7 @@ _READ: dict[str, Callable[[str, str], float]] = {
     "stamp_ns": whole_in,
 }
 _FURTHER = (*_READ, "part", "tool")
-_OF_PLACES = ("outline", "free")
+_OF_PLACES = ("outline", "free_space")
 
 
 def _table(path: Path, with_camera: bool) -> tuple[str, tuple[Evidence, ...]]:

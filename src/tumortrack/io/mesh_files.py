@@ -107,9 +107,9 @@ def write_anatomy(folder: Path, anatomy: Anatomy) -> None:
         write_mesh(folder / f"{name}.ply", part)
 
 
-def read_anatomy(folder: Path, kind: Organ = KIDNEY) -> Anatomy:
+def read_anatomy(folder: Path, organ_kind: Organ = KIDNEY) -> Anatomy:
     """Read what ``write_anatomy`` wrote. Raises InputError: no such organ, an unreadable mesh."""
-    parts = [read_mesh(folder / f"{kind.name}.ply")]
+    parts = [read_mesh(folder / f"{organ_kind.name}.ply")]
     while (path := folder / f"tumor_{len(parts)}.ply").exists():
         parts.append(read_mesh(path))
-    return Anatomy(tuple(parts), kind)
+    return Anatomy(tuple(parts), organ_kind)

@@ -78,7 +78,7 @@ def save_model(model: Model, folder: Path) -> None:
     content = {
         "parts": list(model.parts),
         **model.entries(),
-        "familiar": to_builtins(model.in_distribution),
+        "in_distribution": to_builtins(model.in_distribution),
         "provenance": model.provenance,
         "config": to_builtins(model.config),
     }
@@ -95,7 +95,7 @@ def organ_of(manifest: dict[str, Any], folder: Path) -> Organ:
     return organ_in(manifest.get("provenance", {}).get("organ"), str(folder))
 
 
-def weakness_of(provenance: dict[str, Any]) -> str:
+def reliability_warning(provenance: dict[str, Any]) -> str:
     """Why no estimate of a model should be relied on, by what training knows of it, and what to do;
     empty: no reason is known."""
     far, half_turn_mm = provenance.get("validation_far"), provenance.get("half_turn_mm")

@@ -114,13 +114,13 @@ def _lps_from_index(path: Path, header: Any) -> Float[np.ndarray, "4 4"]:
             forms = [s, *_without_shear(s)] if np.isfinite(s).all() else [s]
             agree = any((np.sum(s * q, axis=0) > math.cos(_SAME_TURN)).all() for s in forms)
             equal = np.allclose(steps[0], steps[1], rtol=_EQUAL_STEPS, atol=0)
-            apart_mm = np.linalg.norm(sform[:3, 3] - qform[:3, 3])
-        if not (agree and equal and apart_mm <= max(steps[0])):
+            distance_mm = np.linalg.norm(sform[:3, 3] - qform[:3, 3])
+        if not (agree and equal and distance_mm <= max(steps[0])):
             voxels = " and ".join(" x ".join(f"{mm:.4g}" for mm in step) for step in steps)
             what = "affines" if agree else "orientations"
             raise InputError(
                 f"{path}: its two {what} (sform, qform) disagree: voxels of {voxels} mm, origins "
-                f"{apart_mm:.4g} mm apart. Export it again from the DICOM series."
+                f"{distance_mm:.4g} mm apart. Export it again from the DICOM series."
             )
     return RAS_FROM_LPS @ np.asarray(sform if sform_code else qform, np.float64)
 

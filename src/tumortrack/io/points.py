@@ -221,7 +221,7 @@ def camera_table(table: PointTable, motion: Motion | None) -> bytes:
     Raises InputError: there is no motion; NoEstimate: a point's place is not finite."""
     if motion is None:
         raise InputError("this estimate does not know where points of the CT are.")
-    camera_mm, std_mm = motion.carry(table.points_ct), motion.std_mm(table.points_ct)
+    camera_mm, std_mm = motion.forward(table.points_ct), motion.std_mm(table.points_ct)
     added = camera_mm if std_mm is None else np.column_stack([camera_mm, std_mm])
     if not np.isfinite(added).all():
         raise NoEstimate("the motion carries some of the points to no place that is a number.")

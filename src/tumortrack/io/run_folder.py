@@ -176,7 +176,7 @@ def _places_in_ct(estimate: Estimate) -> dict[str, np.ndarray]:
     and largest_std_mm of their places; those that are known."""
     if estimate.motion is None:
         return {}
-    points_ct = estimate.motion.back(estimate.cloud.points_mm.astype(np.float64))
+    points_ct = estimate.motion.inverse(estimate.cloud.points_mm.astype(np.float64))
     if points_ct is None:
         return {}
     places = {f"ct_{axis}": points_ct[:, n].astype(np.float32) for n, axis in enumerate("xyz")}

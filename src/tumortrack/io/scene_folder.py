@@ -96,7 +96,7 @@ def write_scene_files(folder: Path, scene: Scene) -> None:
     if scene.evidence:
         store.write_atomically(folder / _EVIDENCE, evidence_json(scene.evidence))
     fixed = {"units": "mm", "frame": "camera", _STAMP: scene.cloud.stamp_ns, _UNITED: True}
-    meta = {**scene.meta, **fixed, "organ": organ_entry(scene.reference.kind)}
+    meta = {**scene.meta, **fixed, "organ": organ_entry(scene.reference.organ_kind)}
     store.write_json(folder / "meta.json", meta)
 
 
@@ -166,14 +166,14 @@ def list_scenes(folder: Path) -> list[Path]:
 
 def _check_parts(folder: Path, anatomy: Anatomy) -> None:
     last = f"tumor_{len(anatomy.tumors)}"
-    strays = {path.stem for path in folder.glob("tumor_*.ply")} - set(anatomy.names)
-    if strays:
-        stray = folder / f"{sorted(strays)[0]}.ply"
+    outliers = {path.stem for path in folder.glob("tumor_*.ply")} - set(anatomy.names)
+    if outliers:
+        stray = folder / f"{sorted(outliers)[0]}.ply"
         raise InputError(f"{stray} does not follow {last}.ply. Number them without a gap.")
     low, high = _ORGAN_SIZE_MM
     size_mm = anatomy.organ.longest_mm
     if not low <= size_mm <= high:
-        path = folder / f"{anatomy.kind.name}.ply"
+        path = folder / f"{anatomy.organ_kind.name}.ply"
         allowed = f"{low:g} to {high:g} mm"
         raise InputError(f"{path} is {size_mm:.3g} wide; an organ has {allowed}. Scale all to mm.")
 
@@ -186,7 +186,7 @@ def _united(folder: Path, anatomy: Anatomy) -> Anatomy:
         joined = organ + tumor
         if joined.volume() - organ.volume() > _STICKS_OUT * tumor.volume():
             organ = joined
-    return anatomy if organ is whole else anatomy.of((mesh_of(organ), *anatomy.tumors))
+    return anatomy if organ is whole else anatomy.with_parts((mesh_of(organ), *anatomy.tumors))
 
 
 def draw_targets(anatomy_ct: Anatomy, seed: int) -> InnerPoints:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.core.geometry import HERE, Affine
+from tumortrack.core.geometry import IDENTITY, Affine
 from tumortrack.io.depth_files import read_poses
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.poses import CameraPoses
@@ -62,7 +62,7 @@ def camera_setup(
                 f"the frame of these poses{where.frame_id and f', {where.frame_id!r}'}."
             )
         frame_now = published or PublishedFrame(name, calibrated=True, moves=True)
-        return CameraSetup(replace(frame_now, published_from_camera=HERE), configs, poses=where)
+        return CameraSetup(replace(frame_now, published_from_camera=IDENTITY), configs, poses=where)
     if poses is None:
         return CameraSetup(published or PublishedFrame(), configs)
     frame_id, places = read_poses(poses, len(sources))
@@ -127,8 +127,8 @@ class Cameras:
     def latency_from(self) -> str:
         return self.workers[self._lead].latency_from
 
-    def born_ns(self, seen: Observation) -> int:
-        return self.workers[self._lead].born_ns(seen)
+    def capture_ns(self, seen: Observation) -> int:
+        return self.workers[self._lead].capture_ns(seen)
 
     def take(self, timeout_s: float) -> Observation | TumortrackError | None:
         """As ``SourceWorker.take``; raises what stopped any of them. Where the camera that leads
@@ -140,7 +140,7 @@ class Cameras:
         for n in sorted(range(len(self.workers)), key=lambda n: n != self._lead):
             got = self._next(n, timeout_s if n == self._lead else 0.0)
             if isinstance(got, Observation):
-                age_s = (time.time_ns() - self.workers[n].born_ns(got)) * 1e-9
+                age_s = (time.time_ns() - self.workers[n].capture_ns(got)) * 1e-9
                 if age_s <= self._stale_s:
                     self._lead = n
                     return got

@@ -53,7 +53,7 @@ class LoopConfig(Config, frozen=True, kw_only=True):
     nor holds for one whose frames are made ``on_demand``. ``intrinsics``: replace the
     source's, ``correction`` of depths included; ``depth_error``: of depths. ``frozen_s``: an image
     that repeats bit for bit for this time is old; 0: it may repeat. ``seconds``: the loop ends this
-    time after the first frame; 0: never. ``scan``: the first estimate is from several looks."""
+    time after the first frame; 0: never. ``scan``: the first estimate is from several views."""
 
     region: RegionConfig = RegionConfig()
     follower: FollowerConfig = FollowerConfig()
@@ -191,14 +191,14 @@ class Loop:
         live_clock = source.latency_from != "taking"
         # A frame that is made on demand waits for this computer alone, however slow that is.
         stale_s = math.inf if source.on_demand else self._config.stale_s
-        result = self._answer(seen, source.born_ns(seen), live_clock, stale_s)
+        result = self._answer(seen, source.capture_ns(seen), live_clock, stale_s)
         late_ms = result.latency_ms if live_clock and result.estimate is not None else None
         return result, time.monotonic() - (late_ms or 0.0) / 1000
 
     def _answer(
-        self, seen: Observation, born_ns: int, live_clock: bool, stale_s: float
+        self, seen: Observation, capture_ns: int, live_clock: bool, stale_s: float
     ) -> TrackingResult:
-        """The result of one frame of the time ``born_ns``. ``live_clock``: time goes on while we
+        """The result of one frame of the time ``capture_ns``. ``live_clock``: time goes on while we
         work, so an answer can come too late: more than ``stale_s`` after its frame."""
         organ, estimate, reason, warning, timely = None, None, "", "", False
         quality: Quality = "none"
@@ -210,8 +210,8 @@ class Loop:
         several = len(self._cameras.workers) > 1
         try:
             # Simulations have this computer's clock, and so has the arrival.
-            other_clock = born_ns == seen.stamp_ns and seen.truth is None
-            check_age(_age_s(born_ns), stale_s, other_clock)
+            other_clock = capture_ns == seen.stamp_ns and seen.truth is None
+            check_age(_age_s(capture_ns), stale_s, other_clock)
             timely = True
             if self._stamp is not None and seen.stamp_ns <= self._stamp[0]:  # set back: see workers
                 self.statistics.clock_jumps += 1
@@ -232,8 +232,8 @@ class Loop:
                 estimate = estimate.reporting(cameras=tuple(view.number for view, _ in found))
             finding, warning = self._confirmed(estimate, doubt)
             quality = "good" if finding is None else "poor"
-            if live_clock and _age_s(born_ns) > stale_s:
-                raise NoEstimate(Finding("too_late", {"seconds": _age_s(born_ns)}))
+            if live_clock and _age_s(capture_ns) > stale_s:
+                raise NoEstimate(Finding("too_late", {"seconds": _age_s(capture_ns)}))
         except Exception as error:
             finding = _finding_of(error)
             estimate, reason, quality, warning = None, str(error), "none", ""
@@ -243,8 +243,8 @@ class Loop:
                 self._in_a_row = 0
             if not isinstance(error, TumortrackError):  # a defect of ours: the next frame is tried
                 self.statistics.add_defect(error)
-                finding = Finding("defect", {"words": type(error).__name__, "error": str(error)})
-                reason = finding.words
+                finding = Finding("defect", {"message": type(error).__name__, "error": str(error)})
+                reason = finding.message
         self._stamp = (seen.stamp_ns, time.monotonic_ns())
         unnamed = self._published.frame_id == "camera" and not self._published.calibrated
         if unnamed and seen.frame_id:
@@ -262,7 +262,7 @@ class Loop:
             organ,
             published if lead is None else published.of_camera(lead.published_from_camera),
             seconds,
-            latency_ms=1000 * _age_s(born_ns),
+            latency_ms=1000 * _age_s(capture_ns),
             dropped=self._cameras.dropped,
             views=tuple(views) if several else (),
             cameras=camera_words(numbers, absent) if several else self.views.scanned,
@@ -275,11 +275,11 @@ class Loop:
         estimate counts as good again when several in a row were."""
         finding, warning = estimate.finding, estimate.reason
         if doubt and finding is None:
-            finding, warning = Finding("frame_in_doubt", {"words": doubt}), doubt
+            finding, warning = Finding("frame_in_doubt", {"message": doubt}), doubt
         self._in_a_row = self._in_a_row + 1 if finding is None else 0
         if 0 < self._in_a_row < SURE_AFTER:
             finding = Finding("good_again", {"frames": self._in_a_row, "of": SURE_AFTER})
-            return finding, finding.words
+            return finding, finding.message
         return finding, warning
 
     def _without_frame(self, reason: str | Finding | Exception) -> TrackingResult:
@@ -292,7 +292,7 @@ class Loop:
         return TrackingResult(
             next(self._sequence),
             stamp_ns,
-            reason=finding.words,
+            reason=finding.message,
             published_frame=self._published,
             finding=finding,
         )
@@ -354,11 +354,11 @@ def _check_heard(silent_s: float, most_s: float, trouble: str) -> None:
 
 def _finding_of(reason: str | Finding | Exception) -> Finding:
     known = reason.finding if isinstance(reason, NoEstimate) else reason
-    return known if isinstance(known, Finding) else Finding("source", {"words": str(reason)})
+    return known if isinstance(known, Finding) else Finding("source", {"message": str(reason)})
 
 
-def _age_s(born_ns: int) -> float:
-    return (time.time_ns() - born_ns) * 1e-9
+def _age_s(capture_ns: int) -> float:
+    return (time.time_ns() - capture_ns) * 1e-9
 
 
 def summary(

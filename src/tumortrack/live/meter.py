@@ -68,7 +68,7 @@ class RunStatistics:
     def add(self, result: TrackingResult) -> None:
         self.counts[result.quality] += 1
         if result.reason:
-            finding = result.finding or Finding("source", {"words": result.reason})
+            finding = result.finding or Finding("source", {"message": result.reason})
             more = len(self._labels) >= _KINDS
             label = "other reasons" if more else finding.words_without_numbers
             self.reasons[self._labels.setdefault(finding.same_as, label)] += 1

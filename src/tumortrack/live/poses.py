@@ -12,7 +12,7 @@ import numpy as np
 
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.geometry import HERE, Affine, rigid
+from tumortrack.core.geometry import IDENTITY, Affine, rigid
 from tumortrack.core.report import Finding
 from tumortrack.core.store import read_file
 from tumortrack.io.csv_tables import read_rows, whole_in
@@ -34,7 +34,7 @@ class CameraPoses:
     ``frame_id`` names the fixed frame; empty: unknown."""
 
     frame_id = ""
-    tool_from_camera = HERE
+    tool_from_camera = IDENTITY
 
     def at(self, seen: Observation) -> Affine:
         """Fixed frame from camera at the observation's stamp. Raises NoEstimate: it is unknown."""

@@ -107,7 +107,7 @@ class Session:
         self.about = {
             "patient": to_builtins(loaded.patient),
             "model": loaded.provenance,
-            "notes": [weakness.words for weakness in loaded.warnings],
+            "notes": [weakness.message for weakness in loaded.warnings],
             **digest,
             "source": next(iter(setup.sources)),
             "sinks": list(self._named),
@@ -197,7 +197,7 @@ def _cameras(source: str | SourceConfig, options: TrackOptions) -> CameraSetup:
     elif options.intrinsics and options.views:
         wrong = "--intrinsics is of one camera; with --views each says its own"
     elif options.scan and not options.moving:
-        wrong = "--scan is of one camera that moves (--moving); several look all the time"
+        wrong = "--scan is of one camera that moves (--moving); several view all the time"
     if wrong:
         raise InputError(f"{wrong}. Leave it out.")
     return camera_setup((source, *options.views), options.poses, options.moving, options.frame)

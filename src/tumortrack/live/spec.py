@@ -76,7 +76,7 @@ SOURCES = Registry[SourceConfig](
         *("virtual", "recording", "ros2"),
         realsense="tumortrack-devices[realsense]",
         stereo="tumortrack-devices[stereo]",
-        rehearsal="tumortrack-lab",
+        rehearsal="tumortrack-benchmarks",
     ),
 )
 SINKS = Registry[SinkConfig](

@@ -93,8 +93,8 @@ class Tools:
         """The estimate of that view."""
         told = estimate.report.evidence[-len(self._given) :] if self._given else ()
         for piece, said in zip(self._given, told, strict=False):
-            if said.left_out and piece.tool in self._tools:
-                self._tools[piece.tool].counts["left_out"] += 1
+            if said.rejected and piece.tool in self._tools:
+                self._tools[piece.tool].counts["rejected"] += 1
         for name, tool in self._tools.items():
             with self._guarded(name):
                 tool.located(view, estimate)

@@ -217,7 +217,7 @@ class TrackingResult(Renamed):
         dropped: frames so far that newer ones replaced.
         views: of several cameras, what each saw.
         cameras: in words, which cameras the estimate is from and why not from the others; of a
-            scan, what each look added; else empty.
+            scan, what each view added; else empty.
         playback: what was stored is shown: nothing is tracked, and there never is an estimate.
         finding: what ``reason`` or ``warning`` says, by its kind.
         evidence: what became known with this frame, camera frame.
@@ -249,7 +249,10 @@ class TrackingResult(Renamed):
             return None
         pose, cloud = self.published_frame.published_from_camera, self.estimate.cloud
         meshes, structures = (
-            {name: m.moved(transform_points(pose, m.vertices_mm)) for name, m in group.items()}
+            {
+                name: m.with_vertices(transform_points(pose, m.vertices_mm))
+                for name, m in group.items()
+            }
             for group in (self.estimate.meshes, self.estimate.structures)
         )
         points_mm = transform_points(pose, cloud.points_mm)
@@ -292,10 +295,10 @@ class TrackingResult(Renamed):
         return None if center_mm is None else rigid(turn, center_mm)
 
     @property
-    def beside(self) -> str:
+    def extra_status(self) -> str:
         """``cameras``, and how much evidence is in use or was left out, in words."""
         told = () if self.estimate is None else self.estimate.report.evidence
-        out = sum(piece.left_out for piece in told)
+        out = sum(piece.rejected for piece in told)
         words = f"evidence: {len(told) - out} in use, {out} left out" if told else ""
         return "; ".join(filter(None, (self.cameras, words)))
 
@@ -303,7 +306,7 @@ class TrackingResult(Renamed):
         """How good the estimate is, in words, or why there is none."""
         if self.estimate is None:
             return f"none, no estimate: {self.reason}"
-        by = self.beside and f"; {self.beside}"
+        by = self.extra_status and f"; {self.extra_status}"
         if self.quality == "good":
             bounds = bound_words(self.bounds)
             return f"good: {NO_CHECK_FAILED}; {UNVERIFIED}{bounds and f'; {bounds}'}{by}"
@@ -341,15 +344,15 @@ class Controller(Protocol):
 class Controls:
     """What the user asks of the running loop; from any thread. ``picked_mm``: a point on the organ
     (published frame): track the piece that it is on. ``aborted``: the controller stops for good.
-    ``clicks``: colours at clicks in pictures; ``taught``: the classifier learned from them, if they
-    can be separated; ``colour``: its state in words. ``touched``: names of tools of which the user
-    says that they touch now, or take, or let go.
-    ``acknowledged``: evidence that contradicts was wrong."""
+    ``clicks``: colours at clicks in pictures; ``tissue_classifier``: the classifier learned from
+    them, if they can be separated; ``colour``: its state in words. ``touched``: names of tools of
+    which the user says that they touch now, or take, or let go. ``acknowledged``: evidence that
+    contradicts was wrong."""
 
     picked_mm: Float64[np.ndarray, " 3"] | None = None
     aborted: threading.Event = field(default_factory=threading.Event)
     clicks: tuple[Click, ...] = ()
-    taught: TissueClassifier | None = None
+    tissue_classifier: TissueClassifier | None = None
     colour: str = ""
     touched: deque[str] = field(default_factory=deque)
     acknowledged: threading.Event = field(default_factory=threading.Event)
@@ -358,7 +361,7 @@ class Controls:
         """The user clicked on this place (camera frame): on the ``organ``, or beside it. Raises
         InputError, and changes nothing: there is no picture, or it shows too little there."""
         from tumortrack.core.camera import project
-        from tumortrack.segmentation.tissue import sample_click, teach
+        from tumortrack.segmentation.tissue import sample_click, train_tissue_classifier
 
         if seen.picture is None or not isinstance(seen.content, DepthFrame):
             raise InputError(
@@ -369,20 +372,20 @@ class Controls:
         new = sample_click(seen.content, seen.picture, (round(row), round(column)), organ)
         clicks, taught = (*self.clicks, new), None
         try:
-            taught = teach(clicks)
+            taught = train_tissue_classifier(clicks)
             state = f"in use: {100 * taught.right:.0f} % of a click are told by the others"
         except InputError as error:
             state = f"not in use: {error}"
         count = sum(click.organ for click in clicks)
         # At once: no frame in between may be without what former clicks taught.
-        self.clicks, self.taught, self.colour = (
+        self.clicks, self.tissue_classifier, self.colour = (
             clicks,
             taught,
             f"clicks: {count} on the organ, {len(clicks) - count} beside it; {state}",
         )
 
     def forget(self) -> None:
-        self.picked_mm, self.clicks, self.taught, self.colour = None, (), None, ""
+        self.picked_mm, self.clicks, self.tissue_classifier, self.colour = None, (), None, ""
 
 
 @dataclass(frozen=True, eq=False)

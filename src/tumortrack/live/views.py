@@ -15,9 +15,9 @@ from tumortrack.core.assessment import deciding
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.evidence import Evidence
-from tumortrack.core.geometry import HERE, Affine, transform_points, unit
+from tumortrack.core.geometry import IDENTITY, Affine, transform_points, unit
 from tumortrack.core.report import Finding, ScanReport
-from tumortrack.core.types import DepthFrame, Intrinsics, Look, SensorCloud
+from tumortrack.core.types import DepthFrame, Intrinsics, SensorCloud, View
 from tumortrack.live.tools import Tools
 from tumortrack.live.values import CameraView, Observation, PublishedFrame, SinkContext
 from tumortrack.segmentation import Hints, RegionConfig, organ_points
@@ -31,8 +31,8 @@ _NOISE_S = 1.0  # a camera's noise is measured so often: as long as a frame's ot
 _PICK_S = 3.0  # without the organ: a pick is forgotten
 
 SCAN_LOOKS, SCAN_WITHIN_S = 3, 5.0
-# A look sees the organ's shift along its own line of sight, within a millimetre or so. What the
-# others leave open sideways is half along the line of a look from 30 degrees aside.
+# A view sees the organ's shift along its own line of sight, within a millimetre or so. What the
+# others leave open sideways is half along the line of a view from 30 degrees aside.
 SCAN_APART_DEG = 30.0
 
 OrganInView = tuple[CameraView, SensorCloud]  # the organ's points in it
@@ -134,11 +134,11 @@ class ViewsLocator:
         self._follower, self._context = follower, context
         self._region, self._frozen_s, self._seed = region, frozen_s, seed
         self.scan: Scan | None = None  # makes the first estimate, and is gone then
-        self.scanned = ""  # what each of its looks added
+        self.scanned = ""  # what each of its views added
         self._published_from_last = context.published_frame.published_from_camera
         self._picked: Float64[np.ndarray, " 3"] | None = None  # by the user, published frame
         self._place_mm: Float64[np.ndarray, " 3"] | None = None  # where that is by now
-        self._taught: TissueClassifier | None = None  # likewise
+        self._tissue_classifier: TissueClassifier | None = None  # likewise
         self._found_s = time.monotonic()
         # Of the first camera by its calibration, of others as they come.
         self.frames = FrameCheck(context.published_frame, region, frozen_s)
@@ -152,7 +152,7 @@ class ViewsLocator:
     ) -> tuple[list[OrganInView], str]:
         """The organ in each view, and a doubt about the frames. Where several cameras are, those
         that do not see it become ``absent``, with the reason. Raises NoEstimate: none sees it."""
-        self._heed_pick()
+        self._update_selection()
         self.evidence = ()
         found, doubts, several = [], [], len(views) + len(absent) > 1
         for view in views:
@@ -175,7 +175,7 @@ class ViewsLocator:
         ``Follower.locate``."""
         (lead, organ), *more = found
         if self.scan is not None:
-            estimate = self.scan.look(lead, organ)
+            estimate = self.scan.take(lead, organ)
             self._follower.begin(estimate)
             self.scanned = self.scan.summary
             self.frames.notes.append(self.scanned)
@@ -186,7 +186,7 @@ class ViewsLocator:
         estimate = self._follower.locate(
             organ,
             lead.seen.content,
-            views=_further_looks(lead, more),
+            views=_further_views(lead, more),
             evidence=self.evidence,
             camera_from_last=way,
         )
@@ -219,16 +219,18 @@ class ViewsLocator:
     def _camera_from_last(self, view: CameraView) -> Affine:
         """From the frame of the last estimate."""
         if np.array_equal(view.published_from_camera, self._published_from_last):
-            return HERE
+            return IDENTITY
         return np.linalg.inv(view.published_from_camera) @ self._published_from_last
 
-    def _heed_pick(self) -> None:
+    def _update_selection(self) -> None:
         controls = self._context.controls
         if controls.acknowledged.is_set():
             controls.acknowledged.clear()
             self._follower.disputes.acknowledge()
-        if controls.taught is not self._taught:  # what was taken for the organ may be wrong
-            self._taught = controls.taught
+        if (
+            controls.tissue_classifier is not self._tissue_classifier
+        ):  # what was taken for the organ may be wrong
+            self._tissue_classifier = controls.tissue_classifier
             self._follower.forget()
         if controls.picked_mm is not self._picked:  # the user chose again
             self._picked = self._place_mm = controls.picked_mm
@@ -246,7 +248,7 @@ class ViewsLocator:
             camera_from_published = np.linalg.inv(view.published_from_camera)
             place_mm = transform_points(camera_from_published, self._place_mm[None])[0]
         seen = view.seen
-        return Hints(seen.mask, place_mm, last_box_mm, seen.picture, self._taught)
+        return Hints(seen.mask, place_mm, last_box_mm, seen.picture, self._tissue_classifier)
 
     def _follow_pick(self, view: CameraView, organ: SensorCloud) -> None:
         """The organ was found: what the user picked moves along with it."""
@@ -258,8 +260,8 @@ class ViewsLocator:
 
 
 class Scan:
-    """A first estimate from several looks of a camera that is led round an organ at rest.
-    ``summary``: what each look added, once it is done."""
+    """A first estimate from several views of a camera that is led round an organ at rest.
+    ``summary``: what each view added, once it is done."""
 
     def __init__(self, tracker: Tracker) -> None:
         if tracker.anatomy_ct is None:
@@ -267,8 +269,8 @@ class Scan:
         self._tracker, self.summary = tracker, ""
         self._views: list[OrganInView] = []
 
-    def look(self, view: CameraView, organ: SensorCloud) -> Estimate:
-        """The estimate from all looks, in the frame of the last. Raises NoEstimate: they are too
+    def take(self, view: CameraView, organ: SensorCloud) -> Estimate:
+        """The estimate from all views, in the frame of the last. Raises NoEstimate: they are too
         few yet, too much alike, or do not show one organ at rest; then it starts over."""
         oldest_ns = view.seen.stamp_ns - SCAN_WITHIN_S * 1e9
         self._views = [known for known in self._views if known[0].seen.stamp_ns >= oldest_ns]
@@ -277,15 +279,15 @@ class Scan:
         if angles.min(initial=180.0) >= SCAN_APART_DEG:
             self._views.append((view, organ))
         if len(self._views) < SCAN_LOOKS:
-            values: dict[str, float | str] = {"looks": len(self._views), "of": SCAN_LOOKS}
+            values: dict[str, float | str] = {"views": len(self._views), "of": SCAN_LOOKS}
             values |= {"degrees": SCAN_APART_DEG, "seconds": SCAN_WITHIN_S}
             raise NoEstimate(Finding("scan_waits", values))
         *others, (last, cloud) = self._views
         self._views = []
-        looks = _further_looks(last, others)
+        views = _further_views(last, others)
         try:
             estimates = [
-                self._tracker.follow(cloud, seen=last.seen.content, views=looks[:n])
+                self._tracker.follow(cloud, full_view=last.seen.content, views=views[:n])
                 for n in range(SCAN_LOOKS)
             ]
         except NoEstimate as error:
@@ -303,11 +305,11 @@ class Scan:
         return whole
 
 
-def _further_looks(lead: CameraView, views: Sequence[OrganInView]) -> list[Look]:
+def _further_views(lead: CameraView, views: Sequence[OrganInView]) -> list[View]:
     """Views beside that of the camera that leads."""
     lead_from_published = np.linalg.inv(lead.published_from_camera)
     return [
-        Look(organ, view.seen.content, lead_from_published @ view.published_from_camera)
+        View(organ, view.seen.content, lead_from_published @ view.published_from_camera)
         for view, organ in views
     ]
 

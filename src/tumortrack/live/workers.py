@@ -90,7 +90,7 @@ class SourceWorker:
         """No frame will come, and none waits."""
         return self._ended and not self._waits
 
-    def born_ns(self, seen: Observation) -> int:
+    def capture_ns(self, seen: Observation) -> int:
         """The time of the frame taken last, by ``time.time_ns``: its stamp, or, if the source has
         another clock, its arrival; for a lossless source, now."""
         if self.latency_from == "stamp":

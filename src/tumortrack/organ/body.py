@@ -109,7 +109,7 @@ class ElasticBody:
         """The field that points follow, mm per unit of time."""
         return combine(self.modes, np.asarray(coefficients, np.float32))
 
-    def carry(self, coefficients: Float[np.ndarray, " m"], points_ct: Points) -> Moved:
+    def forward(self, coefficients: Float[np.ndarray, " m"], points_ct: Points) -> Moved:
         """Points in or near the undeformed organ in a state; of negative coefficients, back."""
         return self.follow(self.velocity(coefficients), points_ct)
 
@@ -185,7 +185,7 @@ def build_body(
 
 def length_over_kidney(anatomy_ct: Anatomy) -> float:
     """An organ's length over a typical kidney's, to scale what is meant for kidneys (there 1)."""
-    kidney = anatomy_ct.kind.name == KIDNEY.name
+    kidney = anatomy_ct.organ_kind.name == KIDNEY.name
     return 1.0 if kidney else anatomy_ct.organ.longest_mm / _KIDNEY_MM
 
 

@@ -68,7 +68,7 @@ def modes_of(
     """``count`` modes of the responses to loads (f, n) with the tumors' contrasts in turn, as
     displacements of the solid's nodes: a unit coefficient moves the organ by 1 mm rms. The last
     mode swells the organ; the others keep its volume."""
-    rigid = _RigidMotions.of(solid)
+    rigid = _RigidMotions.from_solid(solid)
     mass, forces = rigid.mass, rigid.balanced(np.column_stack([loads, solid.swelling]))
     responses = np.empty_like(forces)
 
@@ -106,7 +106,7 @@ def compliance_modes(
     radius_mm = np.sqrt(areas.sum() / chosen.size) / 2
     spots = np.stack([patches.spot(place, radius_mm) * areas for place in points_mm[chosen[0]]], 1)
     forces = np.einsum("pn,de->pdne", spots / spots.sum(0), np.eye(3)).reshape(len(areas), 3, -1)
-    rigid = _RigidMotions.of(solid)
+    rigid = _RigidMotions.from_solid(solid)
     balanced = rigid.balanced(_at_nodes(forces, solid, patches))
     responses = rigid.removed(solid.factor(CONTRAST).solve(balanced))
     shares = np.sqrt(areas / areas.sum())[:, None, None]
@@ -124,7 +124,7 @@ class _RigidMotions:
     inverse: Float64[np.ndarray, "6 6"]  # of the motions' inner products
 
     @classmethod
-    def of(cls, solid: LatticeSolid) -> _RigidMotions:
+    def from_solid(cls, solid: LatticeSolid) -> _RigidMotions:
         arms, axes = solid.nodes_mm - solid.center_mm, np.eye(3)
         turns = [np.cross(axis, arms).ravel() for axis in axes]
         motions = np.stack([*(np.tile(axis, len(arms)) for axis in axes), *turns], 1)

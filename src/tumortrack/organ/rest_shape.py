@@ -84,7 +84,7 @@ class ModelError:
     precision: Float64[np.ndarray, "k k"]
 
     @classmethod
-    def of(cls, organ: Mesh) -> ModelError:
+    def from_organ(cls, organ: Mesh) -> ModelError:
         """Of an organ in the CT."""
         area_mm2 = np.linalg.norm(triangles_of(organ.vertices_mm, organ.faces)[1], axis=1).sum() / 2
         count = int(area_mm2 / (_APART * _LENGTH_MM) ** 2) + 1
@@ -140,7 +140,7 @@ class RestShape:
     @cached_property
     def model_error(self) -> ModelError:
         """Of the organ's surface."""
-        return ModelError.of(self.anatomy_ct.organ)
+        return ModelError.from_organ(self.anatomy_ct.organ)
 
     @cached_property
     def long_axis_mm(self) -> Float64[np.ndarray, " 3"]:
@@ -190,7 +190,7 @@ class RestShape:
 
     @classmethod
     def from_arrays(
-        cls, arrays: dict[str, np.ndarray], n_parts: int, kind: Organ = KIDNEY
+        cls, arrays: dict[str, np.ndarray], n_parts: int, organ_kind: Organ = KIDNEY
     ) -> RestShape:
         """The inverse of ``to_arrays``; InputError for an array that is missing or misshapen."""
         parts, fields, structures = [], [], {}
@@ -214,5 +214,5 @@ class RestShape:
         except KeyError as error:
             raise InputError(f"the organ's shape lacks {error}; make the model again.") from error
         of_body = {k.removeprefix(_BODY): v for k, v in arrays.items() if k.startswith(_BODY)}
-        anatomy_ct = Anatomy(tuple(parts), kind, structures)
+        anatomy_ct = Anatomy(tuple(parts), organ_kind, structures)
         return cls(anatomy_ct, ElasticBody.from_arrays(of_body), tuple(fields))

@@ -1,1 +1,1 @@
-"""The method of the preset `clinic`; read ``registration`` first, which names the steps."""
+"""The method of the preset `elastic`; read ``registration`` first, which names the steps."""

@@ -67,7 +67,7 @@ class RegistrationConfig(ModelConfig, frozen=True):
         self.check_between("calibration", scenes=(1, 10_000), searched=(1, self.scenes))
 
 
-def clinic(
+def elastic(
     anatomy: Anatomy, rotations: Rotations = "limited", tilt_degrees: float = 30.0
 ) -> RegistrationConfig:
     """The default: an elastic body is registered, and calibrated on scenes with sensor errors,

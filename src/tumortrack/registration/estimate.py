@@ -16,26 +16,26 @@ from tumortrack.core.geometry import largest_std_of
 from tumortrack.core.raster import label_grid
 from tumortrack.core.report import (
     AllowedPoses,
+    AlternativeFit,
     EvidenceReport,
     ExcludedFit,
     FitCost,
     FitReport,
     MotionReport,
     PartReport,
-    RivalFit,
     SizeFit,
     SmoothingReport,
 )
-from tumortrack.core.types import Anatomy, CameraLabels, Look, Mesh, OccupancyCloud
+from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud, View
 from tumortrack.native import F32, F64, I32, kernel
-from tumortrack.registration.bend import BentFit
+from tumortrack.registration.compliance import RefinedFit
 from tumortrack.registration.config import GaussNewtonConfig
-from tumortrack.registration.evidence import Known
+from tumortrack.registration.evidence import TrackedEvidence
 from tumortrack.registration.frame import Frame, describe_parts, grid_over, residuals
 from tumortrack.registration.gauss_newton import FARTHEST, RegistrationResult
-from tumortrack.registration.looks import Looks, depth_share
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.multi_view import MultiViewCloud, depth_share
 from tumortrack.registration.search import PosePrior
 
 QUERIES = 40_000  # as many as the paper asks
@@ -57,7 +57,7 @@ class Found(NamedTuple):
     prior: PosePrior
     shown: ElasticMotion
     pieces: tuple[Evidence, ...] = ()
-    before: tuple[Known, ...] = ()
+    before: tuple[TrackedEvidence, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,22 +112,22 @@ class EstimateMaker:
     def estimate(
         self,
         frame: Frame,
-        looks: Sequence[Look],
+        views: Sequence[View],
         found: Found,
-        bent: BentFit,
+        refined: RefinedFit,
         smoothing: SmoothingReport | None = None,
         grid: int | None = None,
     ) -> Estimate:
         """Of a frame. ``grid``: voxels along the longest side of the volume; None: there is none,
         and the labelled points are the same ones in every frame."""
         fit, config, stamp_ns = found.fit, self._model.config.refine, frame.cloud.stamp_ns
-        size = fit.looks.apparent_size(fit.motion, config)
+        size = fit.views.apparent_size(fit.motion, config)
         with frame.stage("surfaces"):
-            placed = self._placed(fit, bent, size)
+            placed = self._placed(fit, refined, size)
         volume = None
         if grid is None:
-            with frame.stage("carry"):
-                inside = self._carry(placed, stamp_ns)
+            with frame.stage("forward"):
+                inside = self._forward(placed, stamp_ns)
         else:
             with frame.stage("fine"):
                 inside = self._drawn(placed, stamp_ns, frame.rng)
@@ -138,11 +138,11 @@ class EstimateMaker:
                 volume = CameraLabels(
                     label_grid(parts, camera_from_index, shape), camera_from_index
                 )
-        told, known = _evidence_of(found, bent, placed.motion)
+        told, known = _evidence_of(found, refined, placed.motion)
         report = FitReport(
-            parts=self._parts(placed, inside, fit.looks, bent),
+            parts=self._parts(placed, inside, fit.views, refined),
             seed=frame.seed,
-            points=sum(len(look.cloud.points_mm) for look in looks),
+            points=sum(len(view.cloud.points_mm) for view in views),
             voxel_mm=None if volume is None else float(volume.camera_from_index[0, 0]),
             size=size,
             smoothing=smoothing,
@@ -151,20 +151,20 @@ class EstimateMaker:
             poses=AllowedPoses(
                 up_lps=found.prior.up_ct.tolist(),
                 tilt_degrees=found.prior.tilt_degrees,
-                either_side=found.prior.either_side,
+                allow_flip=found.prior.allow_flip,
             ),
             motion=MotionReport(
                 camera_from_ct=placed.motion.camera_from_ct.tolist(),
                 coefficients=placed.motion.coefficients.tolist(),
-                rarity=fit.motion.rarity,
-                steps=bent.steps,
-                compliance_std_mm=bent.compliance_std_mm,
-                misfit_mm=bent.misfit_mm,
+                normalized_mahalanobis=fit.motion.normalized_mahalanobis,
+                steps=refined.steps,
+                compliance_std_mm=refined.compliance_std_mm,
+                misfit_mm=refined.misfit_mm,
                 depth_share=placed.motion.depth_share,
             ),
-            looks=fit.looks.described() if len(looks) > 1 else None,
+            views=fit.views.described() if len(views) > 1 else None,
             evidence=told,
-            fit_mm=residuals(np.abs(bent.distances_mm)),
+            fit_mm=residuals(np.abs(refined.distances_mm)),
             timings=frame.timings,
         )
         return Estimate(
@@ -178,38 +178,38 @@ class EstimateMaker:
             evidence=known,
         )
 
-    def warm(self, fit: RegistrationResult, bent: BentFit) -> None:
+    def warm(self, fit: RegistrationResult, refined: RefinedFit) -> None:
         """Prepare what the first estimate of a frame would wait for."""
-        size = fit.looks.apparent_size(fit.motion, self._model.config.refine)
-        self._carry(self._placed(fit, bent, size), 0)
+        size = fit.views.apparent_size(fit.motion, self._model.config.refine)
+        self._forward(self._placed(fit, refined, size), 0)
 
-    def _placed(self, fit: RegistrationResult, bent: BentFit, size: SizeFit) -> _Placed:
+    def _placed(self, fit: RegistrationResult, refined: RefinedFit, size: SizeFit) -> _Placed:
         share = 0.0
-        if len(fit.looks.points_mm):
-            share = depth_share(size, bent.motion.centre_mm[2], fit.looks.depth_error)
+        if len(fit.views.points_mm):
+            share = depth_share(size, refined.motion.centre_mm[2], fit.views.depth_error)
         std_scale = self._model.calibration.std_scale
-        motion = replace(bent.motion, depth_share=share, std_scale=std_scale)
+        motion = replace(refined.motion, depth_share=share, std_scale=std_scale)
         anatomy = self._shape.anatomy_ct
         ends = np.cumsum([len(mesh.vertices_mm) for mesh in self._surfaces])[:-1]
-        moved = np.split(motion.carry(self._vertices_ct), ends)
+        moved = np.split(motion.forward(self._vertices_ct), ends)
         there = zip((*anatomy.names, *anatomy.structures), self._surfaces, moved, strict=True)
-        meshes = {name: mesh.moved(places) for name, mesh, places in there}
+        meshes = {name: mesh.with_vertices(places) for name, mesh, places in there}
         structures = {name: meshes.pop(name) for name in anatomy.structures}
         places_ct = np.concatenate([self.samples_ct, self._shape.middles_ct])
         known_mm2 = motion.covariance_mm2(places_ct)
         assert known_mm2 is not None
-        along = share * motion.carry(places_ct)
+        along = share * motion.forward(places_ct)
         fit_mm2, count = known_mm2 - along[:, :, None] * along[:, None, :], len(self.samples_ct)
         spread = known_mm2[:count], known_mm2[count:], fit_mm2[:count], fit_mm2[count:]
         return _Placed(motion, meshes, structures, *spread)
 
     def _parts(
-        self, placed: _Placed, inside: OccupancyCloud, looks: Looks, bent: BentFit
+        self, placed: _Placed, inside: OccupancyCloud, views: MultiViewCloud, refined: RefinedFit
     ) -> dict[str, PartReport]:
-        known_mm = looks.points_mm  # what was seen, and what evidence says
-        if looks.evidence is not None:
-            known_mm = np.concatenate([known_mm, looks.evidence.places_of_tissue_mm])
-        held_mm = bent.held_by_prior_mm
+        known_mm = views.points_mm  # what was seen, and what evidence says
+        if views.evidence is not None:
+            known_mm = np.concatenate([known_mm, views.evidence.places_of_tissue_mm])
+        held_mm = refined.prior_pull_mm
         surfaces_mm2 = np.split(placed.sample_mm2, self._sample_ends)
         fit_middle_mm = largest_std_of(placed.fit_middle_mm2)
         fit_surface_mm = np.split(largest_std_of(placed.fit_sample_mm2), self._sample_ends)
@@ -218,7 +218,7 @@ class EstimateMaker:
             squares, axes = np.linalg.eigh(placed.middle_mm2[n])
             center_mm = placed.meshes[name].box_mm.mean(0)
             deviations[name] = {
-                "held_by_prior_mm": held_mm[n],
+                "prior_pull_mm": held_mm[n],
                 "fit_std_mm": (float(fit_middle_mm[n]), float(fit_surface_mm[n].max())),
                 "center_std_mm": float(np.sqrt(squares.mean())),
                 "center_axes_std_mm": tuple(np.sqrt(squares[::-1]).tolist()),
@@ -234,11 +234,11 @@ class EstimateMaker:
         points = rng.random((QUERIES, 3), np.float32)
         points *= (upper - lower).astype(np.float32)
         points += lower.astype(np.float32)
-        inside, mine = self._inside(placed.motion.back(points).astype(np.float32))
+        inside, mine = self._inside(placed.motion.inverse(points).astype(np.float32))
         probability = placed.probability(mine)
         return OccupancyCloud(points.take(inside, 0), mine.labels, probability, stamp_ns)
 
-    def _carry(self, placed: _Placed, stamp_ns: int) -> OccupancyCloud:
+    def _forward(self, placed: _Placed, stamp_ns: int) -> OccupancyCloud:
         """The same points of the organ in every frame: labels stay, places and probabilities are
         new."""
         if self._carried is None:
@@ -249,7 +249,7 @@ class EstimateMaker:
                 found = np.concatenate([found, points[self._shape.labels_at(points)[0] > 0]])
             self._carried = self._inside(found[:CARRIED])[1]
         mine = self._carried
-        places = placed.motion.carry(mine.points_ct).astype(np.float32)
+        places = placed.motion.forward(mine.points_ct).astype(np.float32)
         return OccupancyCloud(places, mine.labels, placed.probability(mine), stamp_ns)
 
     def _inside(
@@ -264,57 +264,57 @@ class EstimateMaker:
 
 
 def _evidence_of(
-    found: Found, bent: BentFit, motion: ElasticMotion
-) -> tuple[tuple[EvidenceReport, ...], tuple[Known, ...]]:
+    found: Found, refined: RefinedFit, motion: ElasticMotion
+) -> tuple[tuple[EvidenceReport, ...], tuple[TrackedEvidence, ...]]:
     """What a report says of the evidence, and what the next frame needs of it."""
     if not found.pieces:
         return (), ()
-    evidence, terms, before = bent.looks.evidence, bent.terms, found.before
+    evidence, terms, before = refined.views.evidence, refined.terms, found.before
     assert evidence is not None
     assert terms is not None
     reports = evidence.described(found.pieces, motion, len(before), terms)
-    new = [Known(piece, found.shown) for piece in found.pieces[len(before) :]]
+    new = [TrackedEvidence(piece, found.shown) for piece in found.pieces[len(before) :]]
     pairs = zip((*before, *new), reports, strict=True)
-    return reports, tuple(known for known, entry in pairs if not entry.left_out)
+    return reports, tuple(known for known, entry in pairs if not entry.rejected)
 
 
 def _fit_cost(
     fit: RegistrationResult, prior: PosePrior, usual_cost: float, config: GaussNewtonConfig
 ) -> FitCost:
-    """``usual_cost``: of one look, without its noise. Of several looks the one with most strays
+    """``usual_cost``: of one view, without its noise. Of several looks the one with most outliers
     counts."""
-    looks, strays, now = fit.looks, fit.strays, fit.points_cost
-    if looks.count > 1:
-        far = np.abs(fit.distances_mm) > FARTHEST * looks.width_mm(config)
-        strays = max(float(far[looks.look == n].mean()) for n in range(looks.count))
+    views, outliers, now = fit.views, fit.outliers, fit.points_cost
+    if views.count > 1:
+        far = np.abs(fit.distances_mm) > FARTHEST * views.width_mm(config)
+        outliers = max(float(far[views.view == n].mean()) for n in range(views.count))
     names, middles_ct = fit.motion.shape.anatomy_ct.names, fit.motion.shape.middles_ct
-    here, others = fit.motion.carry(middles_ct), list[RivalFit]()
-    for rival, (_, share) in zip(fit.rivals, fit.motion.rivals, strict=False):
-        there = rival.motion.carry(middles_ct)
-        cosine = (np.trace(rival.motion.rotation @ fit.motion.rotation.T) - 1) / 2
-        apart_mm = np.linalg.norm(there - here, axis=1).tolist()
+    here, others = fit.motion.forward(middles_ct), list[AlternativeFit]()
+    for alternative, (_, share) in zip(fit.alternatives, fit.motion.alternatives, strict=False):
+        there = alternative.motion.forward(middles_ct)
+        cosine = (np.trace(alternative.motion.rotation @ fit.motion.rotation.T) - 1) / 2
+        distance_mm = np.linalg.norm(there - here, axis=1).tolist()
         others.append(
-            RivalFit(
-                more=rival.cost - fit.cost,
+            AlternativeFit(
+                more=alternative.cost - fit.cost,
                 share=share,
-                apart_mm=dict(zip(names, apart_mm, strict=True)),
+                distance_mm=dict(zip(names, distance_mm, strict=True)),
                 center_mm=dict(zip(names, map(tuple, there.tolist()), strict=True)),
                 turn_degrees=float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
             )
         )
     # With the other side up, as good, or better where that is excluded; or this fit, if it is so.
-    excluded = fit if prior.excludes(fit.motion.rotation) else fit.beyond
-    beyond = None
+    excluded = fit if prior.excludes(fit.motion.rotation) else fit.excluded_pose
+    excluded_pose = None
     if excluded is not None:
         tilt_degrees = float(prior.tilt_degrees_of(excluded.motion.rotation))
-        beyond = ExcludedFit(less=fit.cost - excluded.cost, tilt_degrees=tilt_degrees)
+        excluded_pose = ExcludedFit(less=fit.cost - excluded.cost, tilt_degrees=tilt_degrees)
     return FitCost(
         now=now,
-        without_strays=fit.cost_without_strays - (fit.cost - now),
-        usual=usual_cost * looks.count + looks.noise_cost(config),
-        strays=strays,
+        without_outliers=fit.cost_without_strays - (fit.cost - now),
+        usual=usual_cost * views.count + views.noise_cost(config),
+        outliers=outliers,
         others=tuple(others),
-        beyond=beyond,
+        excluded_pose=excluded_pose,
     )
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.evidence import Evidence, Free, Held, Landmark, Outline, Touch
+from tumortrack.core.evidence import Evidence, FreeSpace, Grasp, Landmark, Outline, Touch
 from tumortrack.core.geometry import Affine, transform_points
 from tumortrack.core.mesh_query import surface_distance
 from tumortrack.core.report import EvidenceReport
@@ -125,7 +125,7 @@ class EvidenceTerms:
     shared_mm: Float64[np.ndarray, " tools"]  # its deviation
 
     @classmethod
-    def of(
+    def from_evidence(
         cls, evidence: Sequence[Evidence], parts: Sequence[str], most: float = _MOST
     ) -> EvidenceTerms | None:
         """``parts``: names of what can be touched (``Anatomy.closed``). None: there is no evidence.
@@ -138,8 +138,8 @@ class EvidenceTerms:
             tool_name = (each.shared_std_mm and each.tool) or f"piece {number}"
             tools[tool_name] = max(each.shared_std_mm, tools.get(tool_name, 0.0))
             about = number, list(tools).index(tool_name)
-            if isinstance(each, Landmark | Held):
-                which_mm = each.point_std_mm if isinstance(each, Held) else 0.0
+            if isinstance(each, Landmark | Grasp):
+                which_mm = each.point_std_mm if isinstance(each, Grasp) else 0.0
                 whole_mm = math.hypot(each.std_mm, which_mm)
                 points.append((each.point_ct, each.place_mm, whole_mm, *about))
                 continue
@@ -150,7 +150,7 @@ class EvidenceTerms:
                 )
             away_mm = 0.0 if isinstance(each, Outline) else each.tip_mm
             std_mm = math.hypot(each.std_mm, _SURFACE_MM)
-            kind = parts.index(name), away_mm, isinstance(each, Free), std_mm
+            kind = parts.index(name), away_mm, isinstance(each, FreeSpace), std_mm
             surfaces += [(place, *kind, *about) for place in each.places]
         if not surfaces and not points:
             return None
@@ -176,7 +176,7 @@ class EvidenceTerms:
         off_mm[self.free] = np.minimum(off_mm[self.free], 0)
         residuals_mm, by_motion = [off_mm], [rows[:, :-1] * (off_mm != 0)[:, None]]
         if len(self.points_ct):
-            away_mm = (motion.carry(self.points_ct) - self.points_mm) @ motion.rotation
+            away_mm = (motion.forward(self.points_ct) - self.points_mm) @ motion.rotation
             residuals_mm.append(away_mm.ravel())
             by_motion.append(motion.effects(self.points_ct).reshape(-1, unknowns))
         times = np.repeat([1, 3], [len(self.places_mm), len(self.points_ct)])
@@ -238,7 +238,7 @@ class EvidenceTerms:
             off = float(off_mm[number])
             if number in out and isinstance(each, Touch | Outline):  # perhaps beyond the field
                 surface = anatomy_ct.closed[each.part or anatomy_ct.names[0]]
-                off = float(surface_distance(surface, motion.back(np.array(each.places))).max())
+                off = float(surface_distance(surface, motion.inverse(np.array(each.places))).max())
             told.append(
                 EvidenceReport(
                     name=each.name,
@@ -246,8 +246,8 @@ class EvidenceTerms:
                     tool=each.tool,
                     std_mm=each.std_mm,
                     off_mm=off,
-                    news=min(float(shares[number]), 1.0),
-                    left_out=number in out,
+                    information_gain=min(float(shares[number]), 1.0),
+                    rejected=number in out,
                     before=number < before,
                     places_mm=each.places,
                 )
@@ -256,36 +256,36 @@ class EvidenceTerms:
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class TrackedEvidence:
     """A piece of evidence, and the motion as the points alone showed it when it came."""
 
     piece: Evidence
     motion: ElasticMotion
 
-    def seen_from(self, camera_from_last: Affine) -> Known:
+    def seen_from(self, camera_from_last: Affine) -> TrackedEvidence:
         """Before a camera that has moved."""
         places_mm = transform_points(camera_from_last, np.array(self.piece.places))
-        return Known(
+        return TrackedEvidence(
             self.piece.at(places_mm, self.piece.std_mm),
             seen_from_first(self.motion, camera_from_last),
         )
 
 
-def still_known(
-    known: Sequence[Known], motion: ElasticMotion
-) -> tuple[tuple[Known, ...], tuple[Evidence, ...]]:
+def propagate(
+    known: Sequence[TrackedEvidence], motion: ElasticMotion
+) -> tuple[tuple[TrackedEvidence, ...], tuple[Evidence, ...]]:
     """What tells something yet at a later motion, as the points alone show that; and how it is by
     now. What lies on tissue moves with it, and is less sure the farther from where it came. What a
     tool holds, and where no tissue was, tell nothing but in their own frame; nor do the oldest of
     many."""
-    lasting = [each for each in known if not isinstance(each.piece, Held | Free)]
+    lasting = [each for each in known if not isinstance(each.piece, Grasp | FreeSpace)]
     counts = np.cumsum([len(each.piece.places) for each in reversed(lasting)])
     lasting = lasting[len(lasting) - int((counts <= _MOST_KEPT).sum()) :]
-    kept, pieces = list[Known](), list[Evidence]()
+    kept, pieces = list[TrackedEvidence](), list[Evidence]()
     for before, some in groupby(lasting, key=lambda each: each.motion):
         mine = list(some)
         places_mm = np.concatenate([each.piece.places for each in mine])
-        moved_mm = motion.carry(before.back(places_mm))
+        moved_mm = motion.forward(before.inverse(places_mm))
         away_mm = np.linalg.norm(moved_mm - places_mm, axis=1)
         ends = np.cumsum([len(each.piece.places) for each in mine])[:-1]
         parts = zip(mine, np.split(moved_mm, ends), np.split(away_mm, ends), strict=True)

@@ -28,8 +28,8 @@ from tumortrack.organ.flow import BLOCK, MODES, VELOCITY, LatticeField
 from tumortrack.organ.rest_shape import DISTANCES, DistanceField, RestShape
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.evidence import EvidenceTerms, Terms
-from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import POSE, ElasticMotion
+from tumortrack.registration.multi_view import MultiViewCloud
 
 FARTHEST = 2.0  # widths of the robust kernel: what lies beyond weighs less than 1/25
 _STRIDE = 256 + 16  # of the columns in native/fast/gauss_newton.c
@@ -58,7 +58,7 @@ class _State(NamedTuple):
     rotation: np.ndarray  # (3, 3)
     centre_mm: np.ndarray  # (3,)
     coefficients: np.ndarray  # (m,)
-    moved: np.ndarray  # (6,): shift and turn since the start
+    pose_offset: np.ndarray  # (6,): shift and turn since the start
     distances_mm: np.ndarray  # (n,), float32
     curvature: np.ndarray  # (p, p)
     gradient: np.ndarray  # (p,)
@@ -83,33 +83,33 @@ class RegistrationResult:
     Attributes:
         looks: with the places of further cameras as they are corrected for this motion.
         cost: robust data term, prior of the motion, and the further cameras' errors.
-        strays: share of the points farther off than ``FARTHEST`` widths;
+        outliers: share of the points farther off than ``FARTHEST`` widths;
             ``cost_without_strays``: if all lay as the others do.
         distances_mm: the residuals, signed.
-        moved: shift (mm) and turn (rad) from where the prior has the pose.
+        pose_offset: shift (mm) and turn (rad) from where the prior has the pose.
         terms: of the evidence, at the motion.
-        rivals: other minima that explain the points nearly as well; ``beyond``: one that explains
-            them better, in a pose that is excluded (see ``registration.likeliest``).
+        alternatives: other minima that explain the points nearly as well; ``excluded_pose``: one
+            that explains them better, in a pose that is excluded (see ``registration.likeliest``).
     """
 
     motion: ElasticMotion
-    looks: Looks
+    views: MultiViewCloud
     cost: float
-    strays: float
+    outliers: float
     cost_without_strays: float
     distances_mm: Float[np.ndarray, " n"]
     steps: int
-    moved: Float64[np.ndarray, " 6"]
+    pose_offset: Float64[np.ndarray, " 6"]
     terms: Terms | None = None
-    rivals: tuple[RegistrationResult, ...] = ()
-    beyond: RegistrationResult | None = None
+    alternatives: tuple[RegistrationResult, ...] = ()
+    excluded_pose: RegistrationResult | None = None
 
     @property
     def points_cost(self) -> float:
         """The cost without that of evidence."""
         return self.cost - (0.0 if self.terms is None else self.terms.cost)
 
-    def beside(self, evidence: EvidenceTerms | None) -> RegistrationResult:
+    def with_evidence(self, evidence: EvidenceTerms | None) -> RegistrationResult:
         """A fit to points alone, judged by evidence as well."""
         if evidence is None:
             return self
@@ -118,21 +118,25 @@ class RegistrationResult:
         return replace(
             self,
             terms=terms,
-            looks=replace(self.looks, evidence=evidence),
+            views=replace(self.views, evidence=evidence),
             cost=self.cost + more,
             cost_without_strays=self.cost_without_strays + more,
         )
 
     @property
     def others(self) -> tuple[RegistrationResult, ...]:
-        return self.rivals if self.beyond is None else (*self.rivals, self.beyond)
+        return (
+            self.alternatives
+            if self.excluded_pose is None
+            else (*self.alternatives, self.excluded_pose)
+        )
 
 
 def refine(
-    rest: RestShape, looks: Looks, start: ElasticMotion, config: GaussNewtonConfig
+    rest: RestShape, views: MultiViewCloud, start: ElasticMotion, config: GaussNewtonConfig
 ) -> RegistrationResult:
-    """The motion near ``start`` that fits the looks' points and the library best."""
-    descent = GaussNewton(rest, looks, start, config)
+    """The motion near ``start`` that fits the views' points and the library best."""
+    descent = GaussNewton(rest, views, start, config)
     descent.run(config.steps)
     return descent.result()
 
@@ -147,22 +151,22 @@ class GaussNewton:
     def __init__(
         self,
         rest: RestShape,
-        looks: Looks,
+        views: MultiViewCloud,
         start: ElasticMotion,
         config: GaussNewtonConfig,
-        moved: Float64[np.ndarray, " 6"] | None = None,
+        pose_offset: Float64[np.ndarray, " 6"] | None = None,
     ) -> None:
-        body, count = rest.body, len(looks.points_mm)
+        body, count = rest.body, len(views.points_mm)
         precision = prior_precision(rest, config)
-        self._rest, self._looks, last_mm = rest, looks, looks.width_mm(config)
+        self._rest, self._views, last_mm = rest, views, views.width_mm(config)
         self._problem = _Problem(
             modes=body.mode_field,
             center_ct=body.center_ct,
             distances=rest.distances[0],
             precision=precision,
             mean=body.mean,
-            points=np.array(looks.points_mm, np.float32, order="C"),
-            weight=looks.weight(config),
+            points=np.array(views.points_mm, np.float32, order="C"),
+            weight=views.weight(config),
             first_mm=max(config.first_mm, last_mm),
             last_mm=last_mm,
             narrowing=config.narrowing,
@@ -171,7 +175,7 @@ class GaussNewton:
         given = start.rotation, start.centre_mm, start.coefficients
         rotation, centre_mm, coefficients = (np.array(part, float, order="C") for part in given)
         left = np.empty(count, np.float32), np.empty_like(precision), np.empty(len(precision))
-        already = np.zeros(6) if moved is None else np.array(moved, float)
+        already = np.zeros(6) if pose_offset is None else np.array(pose_offset, float)
         self.state = _State(rotation, centre_mm, coefficients, already, *left)
         self.cost, self.steps, self.converged = np.inf, 0, False
         self._terms: Terms | None = None  # of the evidence, at the present state
@@ -180,7 +184,7 @@ class GaussNewton:
         """Continue until ``steps`` are taken since the start, or it has converged."""
         if self.converged or (steps <= self.steps and np.isfinite(self.cost)):
             return
-        if self._looks.evidence is None:
+        if self._views.evidence is None:
             self.steps, self.converged, self.cost = self._descend(self.steps, steps)
             return
         if not np.isfinite(self.cost):
@@ -191,7 +195,7 @@ class GaussNewton:
 
     def _step(self, first: int, last: int) -> None:
         """With the evidence in the equations that it leaves."""
-        state, evidence = self.state, self._looks.evidence
+        state, evidence = self.state, self._views.evidence
         _, self.converged, cost = self._descend(first, last)
         motion = ElasticMotion(self._rest, state.rotation, state.centre_mm, state.coefficients)
         assert evidence is not None
@@ -229,11 +233,11 @@ class GaussNewton:
         far = squares > FARTHEST**2
         of_strays = (squares / (1 + squares))[far].sum()
         of_strays *= self._problem.weight * self._problem.last_mm**2
-        strays = float(far.mean())
-        without = float(self.cost - of_strays) / max(1 - strays, 1 / len(far))
-        costs = self.cost, strays, without
-        left = state.distances_mm, self.steps, state.moved
-        return RegistrationResult(motion, self._looks, *costs, *left, self._terms)
+        outliers = float(far.mean())
+        without = float(self.cost - of_strays) / max(1 - outliers, 1 / len(far))
+        costs = self.cost, outliers, without
+        left = state.distances_mm, self.steps, state.pose_offset
+        return RegistrationResult(motion, self._views, *costs, *left, self._terms)
 
 
 def prior_precision(rest: RestShape, config: GaussNewtonConfig) -> Float64[np.ndarray, "p p"]:

@@ -2,9 +2,9 @@
 
 A network gives an answer for any input. Two numbers tell the organ from something else: how far
 the points spread, and how far they lie from the estimated surface. Both are percentiles over four
-fifths of the points, so that background and strays do not count. Of a registered surface, which
-strays do not draw aside, the second is judged by the half that lies nearest: all that strays can
-leave of anything (the median's breakdown point).
+fifths of the points, so that background and outliers do not count. Of a registered surface, which
+outliers do not draw aside, the second is judged by the half that lies nearest: all that outliers
+can leave of anything (the median's breakdown point).
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.evidence import Evidence
 from tumortrack.core.packages import to_install
 from tumortrack.core.plugins import plugins
-from tumortrack.core.types import Anatomy, Look
+from tumortrack.core.types import Anatomy, View
 from tumortrack.io.case import Case
 from tumortrack.registration.base_model import Model, ModelConfig
 
@@ -34,15 +34,15 @@ class Locator(Protocol):
 
     def locate(
         self,
-        looks: Sequence[Look],
+        views: Sequence[View],
         grid: int,
         seed: int,
         evidence: Sequence[Evidence] = (),
         any_pose: bool = False,
     ) -> Estimate:
-        """See ``Tracker.locate``. The estimate is in the frame of the first look's camera."""
+        """See ``Tracker.locate``. The estimate is in the frame of the first view's camera."""
 
-    def follow(self, looks: Sequence[Look], last: Estimate | None, how: FollowOptions) -> Estimate:
+    def follow(self, views: Sequence[View], last: Estimate | None, how: FollowOptions) -> Estimate:
         """See ``Tracker.follow``. The frame is that of ``locate``."""
 
     def warm(self) -> None:

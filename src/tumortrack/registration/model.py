@@ -31,8 +31,8 @@ from tumortrack.registration.base_model import Model
 from tumortrack.registration.config import RegistrationConfig
 from tumortrack.registration.gauss_newton import RegistrationResult, refine
 from tumortrack.registration.in_distribution import InDistributionRange, fit_mm, spread_mm
-from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.multi_view import MultiViewCloud
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.search import PosePrior
 from tumortrack.simulation.scene import PoseConfig, SceneRecipe, Simulator, body_for
@@ -74,7 +74,7 @@ class RegistrationModel(Model):
         return {SHAPE: save(self.shape.to_arrays())}
 
     def entries(self) -> dict[str, Any]:
-        return {"trust": to_builtins(self.calibration)}
+        return {"calibration": to_builtins(self.calibration)}
 
     def synchronise(self) -> None:
         """Nothing runs beside."""
@@ -84,7 +84,9 @@ class RegistrationModel(Model):
         config = from_builtins(manifest["config"], RegistrationConfig, f"{folder}: config")
         kind = organ_of(manifest, folder)
         shape = RestShape.from_arrays(read_tensors(folder / SHAPE, load), len(known["parts"]), kind)
-        calibration = from_builtins(manifest["trust"], UncertaintyCalibration, f"{folder}: trust")
+        calibration = from_builtins(
+            manifest["calibration"], UncertaintyCalibration, f"{folder}: calibration"
+        )
         up_lps = np.array(known["provenance"]["up_lps"], float)
         if up_lps.shape != (3,) or not np.isclose(np.linalg.norm(up_lps), 1, atol=1e-3):
             raise InputError(f"up_lps {up_lps.tolist()} is no direction.")
@@ -102,13 +104,13 @@ class _Scene:
     """What a camera sees of a known state (camera frame, mm), the true places of inner points, and
     the undeformed organ in the true pose."""
 
-    looks: Looks
+    views: MultiViewCloud
     inner_mm: Float64[np.ndarray, "m 3"]
     place: ElasticMotion
 
     def off_mm(self, motion: ElasticMotion, inner_ct: Float64[np.ndarray, "m 3"]) -> float:
         """The mean error of a motion at the inner points."""
-        return float(np.linalg.norm(motion.carry(inner_ct) - self.inner_mm, axis=1).mean())
+        return float(np.linalg.norm(motion.forward(inner_ct) - self.inner_mm, axis=1).mean())
 
 
 def build_model(
@@ -149,11 +151,11 @@ def build_model(
         cloud = thin_cloud(stage.cloud, config.scene.cloud.n_points, recipe.generator(999))
         turn, shift_mm = stage.camera_from_ct[:3, :3], stage.camera_from_ct[:3, 3]
         place = ElasticMotion(rest, turn.copy(), turn @ body.center_ct + shift_mm, body.mean)
-        inner_mm = stage.carry(inner_ct).astype(float)
-        scenes.append(_Scene(Looks.of([cloud.points_mm]), inner_mm, place))
+        inner_mm = stage.forward(inner_ct).astype(float)
+        scenes.append(_Scene(MultiViewCloud.from_points([cloud.points_mm]), inner_mm, place))
         progress(3 + index, steps)
     nearby = parallel_map(
-        lambda scene: refine(rest, scene.looks, scene.place, config.refine), scenes
+        lambda scene: refine(rest, scene.views, scene.place, config.refine), scenes
     )
     pairs = list(zip(scenes, nearby, strict=True))
     right = [fit.cost for scene, fit in pairs if scene.off_mm(fit.motion, inner_ct) <= FAR_MM]
@@ -162,7 +164,7 @@ def build_model(
     done = count(3 + config.scenes)
 
     def located(scene: _Scene) -> RegistrationResult:
-        fit = registration.register(scene.looks)
+        fit = registration.register(scene.views)
         progress(next(done), steps)
         return fit
 
@@ -170,7 +172,7 @@ def build_model(
     fits = parallel_map(located, scenes[: config.searched])
     depth_error = config.scene.calibration.depth_error
     std_scale, errors = _compared_with_truth(registration, scenes, fits, depth_error, inner_ct)
-    spreads = [spread_mm(scene.looks.points_mm) for scene in scenes]
+    spreads = [spread_mm(scene.views.points_mm) for scene in scenes]
     fits_mm = [fit_mm(np.abs(fit.distances_mm)) for fit in fits]
     return RegistrationModel(
         config=config,
@@ -194,19 +196,19 @@ def _compared_with_truth(
     """The factor for standard deviations, 1 or more, and how far off the answers were."""
     errors, nearest, ratios = [], [], []
     for scene, fit in zip(scenes, fits, strict=False):
-        bent = registration.bend(fit)
-        share = depth_error.share(bent.motion.centre_mm[2])
-        covariance_mm2 = replace(bent.motion, depth_share=share).covariance_mm2(inner_ct)
+        refined = registration.refine_compliance(fit)
+        share = depth_error.share(refined.motion.centre_mm[2])
+        covariance_mm2 = replace(refined.motion, depth_share=share).covariance_mm2(inner_ct)
         assert covariance_mm2 is not None
-        away = bent.motion.carry(inner_ct) - scene.inner_mm
-        errors.append(scene.off_mm(bent.motion, inner_ct))
-        others = [scene.off_mm(rival.motion, inner_ct) for rival in fit.rivals]
+        away = refined.motion.forward(inner_ct) - scene.inner_mm
+        errors.append(scene.off_mm(refined.motion, inner_ct))
+        others = [scene.off_mm(alternative.motion, inner_ct) for alternative in fit.alternatives]
         nearest.append(min([errors[-1], *others]))
         solved = np.linalg.solve(covariance_mm2, away[..., None])[..., 0]
         ratios.append(np.sqrt((solved * away).sum(1)))
     # Not below 1: these organs are states of the library that the fit knows, and real ones are not.
     std_scale = max(1.0, float(np.quantile(np.concatenate(ratios), _COVERED)) / _RADIUS)
-    far = float(np.mean(np.array(nearest) > FAR_MM))  # no rival is right
+    far = float(np.mean(np.array(nearest) > FAR_MM))  # no alternative is right
     return std_scale, {
         "validation_tre_mm": round(float(np.median(errors)), 3),
         "validation_far": far,

@@ -34,8 +34,8 @@ class Pose(NamedTuple):
 # In C: native/fast/motion.c. Derivatives by coefficients are to first order: the modes halfway
 # along a point's path. The opposite flow has the opposite velocity.
 _POSE, _POINTS = (F64[3], F64[3, 3], F64[3]), F32["n", 3]
-_carry = kernel("carry", FLOW, _POSE, _POINTS, F64["n", 3].out)
-_back = kernel("back", FLOW, _POSE, _POINTS, F64["n", 3].out)  # with the opposite flow
+_forward = kernel("forward", FLOW, _POSE, _POINTS, F64["n", 3].out)
+_inverse = kernel("inverse", FLOW, _POSE, _POINTS, F64["n", 3].out)  # with the opposite flow
 _effects = kernel("effects", FLOW, MODES, F64[3], _POINTS, F32["m"].out, F64["n", 3, "p"].out)
 _residual_rows = kernel("residual_rows", MODES, DISTANCES, FLOW, _POSE, _POINTS, F32["n", "q"].out)
 
@@ -62,8 +62,8 @@ class ElasticMotion(Renamed):
         rotation, centre_mm: where the organ's axes and centre are before the camera.
         coefficients: of the body's modes; ``covariance``: of shift (mm), turn (rad; both in the
             CT's axes, about the centre) and coefficients, once fitted.
-        rivals: other motions that explain the points nearly as well, each with its share of the
-            probability.
+        alternatives: other motions that explain the points nearly as well, each with its share of
+            the probability.
         depth_share: standard deviation of the camera's depths, as a share of them, all alike.
         std_scale: a factor for its standard deviations, found on validation scenes.
     """
@@ -73,7 +73,7 @@ class ElasticMotion(Renamed):
     centre_mm: Float64[np.ndarray, " 3"]
     coefficients: Float64[np.ndarray, " m"]
     covariance: Float64[np.ndarray, "p p"] | None = None
-    rivals: tuple[tuple[ElasticMotion, float], ...] = ()
+    alternatives: tuple[tuple[ElasticMotion, float], ...] = ()
     depth_share: float = 0.0
     std_scale: float = 1.0
 
@@ -83,7 +83,7 @@ class ElasticMotion(Renamed):
         return rigid(self.rotation, self.centre_mm - self.rotation @ self.shape.body.center_ct)
 
     @property
-    def rarity(self) -> float:
+    def normalized_mahalanobis(self) -> float:
         """The state's squared Mahalanobis distance in the body's library, whose mean is 1."""
         off = self.coefficients - self.shape.body.mean
         return float(off @ self.shape.body.precision @ off) / len(off)
@@ -98,13 +98,13 @@ class ElasticMotion(Renamed):
             coefficients=self.coefficients + change[POSE:],
         )
 
-    def carry(self, points_ct: Points, /) -> Float64[np.ndarray, "n 3"]:
+    def forward(self, points_ct: Points, /) -> Float64[np.ndarray, "n 3"]:
         """CT (LPS, mm) -> camera frame (mm)."""
-        return self._moved(_carry, self._flow, points_ct)
+        return self._moved(_forward, self._flow, points_ct)
 
-    def back(self, points_camera: Points, /) -> Float64[np.ndarray, "n 3"]:
+    def inverse(self, points_camera: Points, /) -> Float64[np.ndarray, "n 3"]:
         """Camera frame (mm) -> CT (LPS, mm)."""
-        return self._moved(_back, self._opposite, points_camera)
+        return self._moved(_inverse, self._opposite, points_camera)
 
     def std_mm(self, points_ct: Points, /) -> Float64[np.ndarray, " n"] | None:
         """One standard deviation along any axis, mm: the root of the mean over three of them."""
@@ -117,16 +117,16 @@ class ElasticMotion(Renamed):
         return None if covariance is None else largest_std_of(covariance)
 
     def covariance_mm2(self, points_ct: Points, /) -> Float64[np.ndarray, "n 3 3"] | None:
-        """Of the places to which ``carry`` takes points, in the camera's axes: of pose and state to
-        first order, of the rivals and the camera's depths."""
+        """Of the places to which ``forward`` takes points, in the camera's axes: of pose and state
+        to first order, of the alternatives and the camera's depths."""
         if self.covariance is None:
             return None
         points = _given(points_ct)
-        out, places_mm = np.empty((len(points), 3, 3)), self.carry(points)
+        out, places_mm = np.empty((len(points), 3, 3)), self.forward(points)
         parallel_for(lambda part: self._spread(points[part], out[part]), len(points), _FEW)
         out = self.rotation @ out @ self.rotation.T
-        for rival, share in self.rivals:
-            away = rival.carry(points) - places_mm
+        for alternative, share in self.alternatives:
+            away = alternative.forward(points) - places_mm
             out += share * away[:, :, None] * away[:, None, :]
         out *= self.std_scale**2
         along = self.depth_share * places_mm
@@ -190,18 +190,19 @@ def _given(points_mm: Points) -> Float32[np.ndarray, "n 3"]:
     return points
 
 
-def seen_from_first(motion: ElasticMotion, camera_from_look: Affine) -> ElasticMotion:
+def seen_from_first(motion: ElasticMotion, camera_from_view: Affine) -> ElasticMotion:
     """A motion before another camera, as the first one sees it."""
-    turn = camera_from_look[:3, :3]
-    centre_mm = turn @ motion.centre_mm + camera_from_look[:3, 3]
-    rivals = tuple(
-        (seen_from_first(rival, camera_from_look), share) for rival, share in motion.rivals
+    turn = camera_from_view[:3, :3]
+    centre_mm = turn @ motion.centre_mm + camera_from_view[:3, 3]
+    alternatives = tuple(
+        (seen_from_first(alternative, camera_from_view), share)
+        for alternative, share in motion.alternatives
     )
     return replace(
         motion,
         rotation=turn @ motion.rotation,
         centre_mm=centre_mm,
-        rivals=rivals,
+        alternatives=alternatives,
         depth_share=0.0,  # of the first camera, which lies elsewhere
     )
 

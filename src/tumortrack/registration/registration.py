@@ -1,4 +1,4 @@
-"""The method `clinic`, in the order in which it runs: from points of one side to the whole organ.
+"""The method `elastic`, in the order in which it runs: from points of one side to the whole organ.
 
 1. Search (`search`): a rigid organ is fitted to few points from starts all around.
 2. Fit (`gauss_newton`): from the best of these the elastic body's surface is fitted to the points,
@@ -7,8 +7,9 @@
    minima on the way.
 3. Correct (`looks`): where there are several cameras, their places and the motion in turns.
 4. Choose (`likeliest`, below): by cost, and by how the organ may lie, which the case says. Other
-   minima that explain the points nearly as well, and put a tumor elsewhere, are kept as rivals; one
-   that explains them better in a pose that the case excludes makes the answer poor.
+   minima that explain the points nearly as well, and put a tumor elsewhere, are kept as
+   alternatives; one that explains them better in a pose that the case excludes makes the answer
+   poor.
 5. Verdict (`registration.in_distribution`): what cannot be this organ is refused.
 6. Bend (`bend`): what the library's states cannot follow, the body's compliance does; with it, what
    points and evidence leave open.
@@ -30,7 +31,7 @@ import numpy as np
 
 from tumortrack.core.process import parallel_map
 from tumortrack.organ.rest_shape import RestShape
-from tumortrack.registration.bend import BentFit, bend
+from tumortrack.registration.compliance import RefinedFit, refine_compliance
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import (
     FARTHEST,
@@ -44,13 +45,13 @@ from tumortrack.registration.in_distribution import (
     check_in_distribution,
     check_likely,
 )
-from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.multi_view import MultiViewCloud
 from tumortrack.registration.search import (
     PosePrior,
     Search,
     Start,
-    apart_mm,
+    distance_mm,
     far_from,
     turned_starts,
 )
@@ -84,7 +85,7 @@ class Registration:
 
     def register(
         self,
-        looks: Looks,
+        views: MultiViewCloud,
         known: RegistrationResult | None = None,
         timed: Timer = nullcontext,
         again: bool = False,
@@ -97,55 +98,55 @@ class Registration:
             again: there is no reason to doubt ``known``: see ``Search.starts``.
         """
         with timed("search"):
-            starts = self.search.starts(looks, again)
+            starts = self.search.starts(views, again)
         with timed("refine"):
-            best = self.best_fit(looks, starts, known)
-            if looks.count == 1:
-                return self.with_all_points(best, looks)
-            fits = [self._correct_cameras(looks, fit) for fit in (best, *best.others)]
-            return likeliest(fits if known is None else [known, *fits], self.prior)
+            best = self.best_fit(views, starts, known)
+            if views.count == 1:
+                return self.with_all_points(best, views)
+            fits = [self._correct_cameras(views, fit) for fit in (best, *best.others)]
+            return select_best(fits if known is None else [known, *fits], self.prior)
 
     def with_all_points(
-        self, fit: RegistrationResult, looks: Looks, rounds: int = _ROUNDS
+        self, fit: RegistrationResult, views: MultiViewCloud, rounds: int = _ROUNDS
     ) -> RegistrationResult:
-        """The fit, and its rivals', to all points that lie on the organ: those of ``looks`` and the
-        candidates that the fit shows to be the organ's, too; until they stay the same."""
+        """The fit, and its alternatives', to all points that lie on the organ: those of ``looks``
+        and the candidates that the fit shows to be the organ's, too; until they stay the same."""
         near = msgspec.structs.replace(self.config, first_mm=self.config.last_mm)
-        count = len(fit.looks.points_mm)
+        count = len(fit.views.points_mm)
         for _ in range(rounds):
-            more = looks.with_points_on(fit.motion, FARTHEST * looks.width_mm(self.config))
+            more = views.with_points_on(fit.motion, FARTHEST * views.width_mm(self.config))
             if abs(len(more.points_mm) - count) <= _SAME_POINTS * count:
                 break
             count = len(more.points_mm)
             fits = [
-                GaussNewton(self.rest, more, each.motion, near, each.moved)
+                GaussNewton(self.rest, more, each.motion, near, each.pose_offset)
                 for each in (fit, *fit.others)
             ]
             parallel_map(lambda descent: descent.run(near.steps), fits)
-            fit = likeliest([descent.result() for descent in fits], self.prior)
+            fit = select_best([descent.result() for descent in fits], self.prior)
         return fit
 
     def follow(
-        self, looks: Looks, start: ElasticMotion, config: GaussNewtonConfig
+        self, views: MultiViewCloud, start: ElasticMotion, config: GaussNewtonConfig
     ) -> RegistrationResult:
         """The fit near a motion."""
-        return self._correct_cameras(looks, refine(self.rest, looks, start, config))
+        return self._correct_cameras(views, refine(self.rest, views, start, config))
 
-    def bend(self, fit: RegistrationResult) -> BentFit:
+    def refine_compliance(self, fit: RegistrationResult) -> RefinedFit:
         """A fit in the body's compliance."""
-        return bend(fit, self.config)
+        return refine_compliance(fit, self.config)
 
     def check(self, fit: RegistrationResult, usual: InDistributionRange) -> None:
         """Raises NotThisOrgan: points or deformation are none of this organ's."""
-        for n in range(fit.looks.count):
-            mine = fit.looks.look == n
-            points_mm, distances_mm = fit.looks.points_mm[mine], np.abs(fit.distances_mm[mine])
+        for n in range(fit.views.count):
+            mine = fit.views.view == n
+            points_mm, distances_mm = fit.views.points_mm[mine], np.abs(fit.distances_mm[mine])
             check_in_distribution(usual, points_mm, distances_mm, registered=True)
-        check_likely(fit.motion.rarity)
+        check_likely(fit.motion.normalized_mahalanobis)
 
     def best_fit(
         self,
-        looks: Looks,
+        views: MultiViewCloud,
         starts: Sequence[ElasticMotion],
         known: RegistrationResult | None = None,
     ) -> RegistrationResult:
@@ -153,18 +154,18 @@ class Registration:
         best. ``known``: a fit of before."""
         fits = [] if known is None else [known]
         new = [Start(motion) for motion in starts if far_from(motion, [fit.motion for fit in fits])]
-        fits += self._fit_promising(looks, new, fits)
+        fits += self._fit_promising(views, new, fits)
         best = min(fits, key=lambda fit: cost_with_prior(fit, self.prior))
-        fits += self._fit_promising(looks, turned_starts(best.motion, best.moved), fits)
-        return likeliest(fits, self.prior)
+        fits += self._fit_promising(views, turned_starts(best.motion, best.pose_offset), fits)
+        return select_best(fits, self.prior)
 
     def _fit_promising(
-        self, looks: Looks, starts: Sequence[Start], against: Sequence[RegistrationResult]
+        self, views: MultiViewCloud, starts: Sequence[Start], against: Sequence[RegistrationResult]
     ) -> list[RegistrationResult]:
         """All starts are refined by a few steps; those that may still win, against each other and
         known fits, to the end. What the prior excludes gives nothing else up."""
         descents = [
-            GaussNewton(self.rest, looks, start.motion, self.config, start.moved)
+            GaussNewton(self.rest, views, start.motion, self.config, start.pose_offset)
             for start in starts
         ]
         trial, steps = min(_TRIAL_STEPS, self.config.steps), self.config.steps
@@ -180,15 +181,17 @@ class Registration:
         parallel_map(lambda descent: descent.run(steps), promising)
         return [descent.result() for descent in promising]
 
-    def _correct_cameras(self, looks: Looks, fit: RegistrationResult) -> RegistrationResult:
+    def _correct_cameras(
+        self, views: MultiViewCloud, fit: RegistrationResult
+    ) -> RegistrationResult:
         """Further cameras and the motion in turns, from a fit with the cameras as stated."""
-        if looks.count == 1:
+        if views.count == 1:
             return fit
         near = msgspec.structs.replace(self.config, first_mm=self.config.last_mm)
         for _ in range(_CORRECTIONS):
-            looks = looks.corrected(fit.motion, self.config)
-            fit = refine(self.rest, looks, fit.motion, near)
-        costs = fit.cost + looks.cost, fit.cost_without_strays + looks.cost
+            views = views.corrected(fit.motion, self.config)
+            fit = refine(self.rest, views, fit.motion, near)
+        costs = fit.cost + views.cost, fit.cost_without_strays + views.cost
         return replace(fit, cost=costs[0], cost_without_strays=costs[1])
 
 
@@ -197,14 +200,14 @@ def cost_with_prior(fit: RegistrationResult, prior: PosePrior) -> float:
     return fit.cost + float(prior.cost(fit.motion.rotation))
 
 
-def likeliest(fits: Sequence[RegistrationResult], prior: PosePrior) -> RegistrationResult:
+def select_best(fits: Sequence[RegistrationResult], prior: PosePrior) -> RegistrationResult:
     """The likeliest of these fits and their others, by cost and prior of the pose.
 
-    Its rivals are those that are less likely by ``RIVAL_COST`` at most and put the middle of a part
-    where neither its covariance nor those of likelier rivals have it; its motion has their shares
-    of the probability, ``exp(-cost / 2)``. ``beyond`` is the best fit in a pose that the case
-    excludes, if it costs less; its share is 0. Of an organ that was turned over it is the best one
-    that is not: only where that costs far more is it sure that it was.
+    Its alternatives are those that are less likely by ``RIVAL_COST`` at most and put the middle of
+    a part where neither its covariance nor those of likelier alternatives have it; its motion has
+    their shares of the probability, ``exp(-cost / 2)``. ``excluded_pose`` is the best fit in a pose
+    that the case excludes, if it costs less; its share is 0. Of an organ that was turned over it is
+    the best one that is not: only where that costs far more is it sure that it was.
     """
     everything = [each for fit in fits for each in (fit, *fit.others)]
     costs = {id(fit): cost_with_prior(fit, prior) for fit in everything}
@@ -215,13 +218,13 @@ def likeliest(fits: Sequence[RegistrationResult], prior: PosePrior) -> Registrat
             break
         if all(_is_distinct(other.motion, fit.motion) for fit in kept):
             kept.append(other)
-    beyond = _better_on_other_side(first, everything, prior)
+    excluded_pose = _better_on_other_side(first, everything, prior)
     odds = [math.exp((costs[id(first)] - costs[id(fit)]) / 2) for fit in kept]
     shares = [each / sum(odds) for each in odds]
-    rivals = tuple(zip((fit.motion for fit in kept[1:]), shares[1:], strict=True))
-    rivals += () if beyond is None else ((beyond.motion, 0.0),)
-    motion = replace(first.motion, rivals=rivals)
-    return replace(first, motion=motion, rivals=tuple(kept[1:]), beyond=beyond)
+    alternatives = tuple(zip((fit.motion for fit in kept[1:]), shares[1:], strict=True))
+    alternatives += () if excluded_pose is None else ((excluded_pose.motion, 0.0),)
+    motion = replace(first.motion, alternatives=alternatives)
+    return replace(first, motion=motion, alternatives=tuple(kept[1:]), excluded_pose=excluded_pose)
 
 
 def _better_on_other_side(
@@ -238,12 +241,12 @@ def _better_on_other_side(
 
 def _is_distinct(other: ElasticMotion, motion: ElasticMotion) -> bool:
     """Whether a part's middle lies outside the ellipsoid of 95 % of the other's covariance."""
-    bent = np.abs(other.coefficients - motion.coefficients).max()
-    if max(bent, apart_mm(other, motion)) < _SAME_MM:
+    refined = np.abs(other.coefficients - motion.coefficients).max()
+    if max(refined, distance_mm(other, motion)) < _SAME_MM:
         return False  # most are the same minimum, which is quickly found
     middles = motion.shape.middles_ct
-    covariance = replace(motion, rivals=()).covariance_mm2(middles)
+    covariance = replace(motion, alternatives=()).covariance_mm2(middles)
     assert covariance is not None
-    away = other.carry(middles) - motion.carry(middles)
+    away = other.forward(middles) - motion.forward(middles)
     squares = (np.linalg.solve(covariance, away[..., None])[..., 0] * away).sum(1)
     return bool(squares.max() > _WITHIN)

@@ -21,14 +21,14 @@ from tumortrack.core.process import parallel_for
 from tumortrack.native import F32, F64, kernel
 from tumortrack.organ.rest_shape import DISTANCES, RestShape
 from tumortrack.registration.in_distribution import RIVAL_COST
-from tumortrack.registration.looks import Looks
 from tumortrack.registration.motion import POSE, ElasticMotion
+from tumortrack.registration.multi_view import MultiViewCloud
 
 Rotations = Float64[np.ndarray, "*n 3 3"]
 Centres = Float64[np.ndarray, "s 3"]  # of the organ, camera frame, mm
 _TOWARDS_CAMERA = np.array([0.0, 0.0, -1.0])
 # What these numbers rest on: docs/decisions/034-limits.md.
-# Points of all looks, the robust kernel's widths step by step, and the share of the starts that go
+# Points of all views, the robust kernel's widths step by step, and the share of the starts that go
 # on: first all of them on few points, then the better ones on more.
 _STAGES = (
     (100, 15.0 * 0.8 ** np.arange(4), 1 / 4),
@@ -67,20 +67,20 @@ class Start(NamedTuple):
     None: it has it here."""
 
     motion: ElasticMotion
-    moved: Float64[np.ndarray, " 6"] | None = None
+    pose_offset: Float64[np.ndarray, " 6"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class PosePrior:
     """How the organ may lie: ``up_ct`` faces the camera, tilted by up to ``tilt_degrees``; 180: it
-    may lie in any way. ``either_side``: it may also have been turned over."""
+    may lie in any way. ``allow_flip``: it may also have been turned over."""
 
     up_ct: Float64[np.ndarray, " 3"]
     tilt_degrees: float = 30.0
-    either_side: bool = False
+    allow_flip: bool = False
 
     @property
-    def anyhow(self) -> bool:
+    def unconstrained(self) -> bool:
         """Whether every rotation is allowed."""
         return self.tilt_degrees >= 180
 
@@ -92,25 +92,25 @@ class PosePrior:
     def cost(self, rotations: Rotations) -> Float64[np.ndarray, "*n"]:
         """-2 log of their probability, up to a constant: 0 where they are allowed."""
         tilt = self.tilt_degrees_of(rotations)
-        tilt = np.minimum(tilt, 180 - tilt) if self.either_side else tilt
+        tilt = np.minimum(tilt, 180 - tilt) if self.allow_flip else tilt
         # Tilts about two axes, up to tilt_degrees each, add up to sqrt(2) times that.
         beyond = tilt - np.sqrt(2) * self.tilt_degrees
         return np.asarray(np.maximum(0.0, beyond / _SOFT_DEGREES) ** 2)
 
     def excludes(self, rotations: Rotations) -> Bool[np.ndarray, "*n"]:
-        """Whether they are as unlikely as a rival that is given up."""
+        """Whether they are as unlikely as an alternative that is given up."""
         return np.asarray(self.cost(rotations) > RIVAL_COST)
 
     @property
     def as_stated(self) -> PosePrior:
         """Without the chance that it was turned over."""
-        return replace(self, either_side=False)
+        return replace(self, allow_flip=False)
 
     @cached_property
     def sides_ct(self) -> Float64[np.ndarray, "k 3"]:
         """Directions of the CT that starts turn towards the camera."""
         up = unit(self.up_ct)
-        if self.anyhow:
+        if self.unconstrained:
             n = np.arange(_SIDES) + 0.5  # Fibonacci's sphere
             z, turn = 1 - 2 * n / _SIDES, np.pi * (1 + 5**0.5) * n
             flat = np.sqrt(1 - z**2)
@@ -130,26 +130,26 @@ class Search:
     rest: RestShape
     prior: PosePrior
 
-    def starts(self, looks: Looks, again: bool = False) -> list[ElasticMotion]:
+    def starts(self, views: MultiViewCloud, again: bool = False) -> list[ElasticMotion]:
         """Undeformed organs where a rigid one fits best, the best first, at least ``APART_MM``
         apart; the best beyond the prior last. ``again``: of an organ that is being followed, from
         half as many turns, as if nothing were hidden: a sixth of the time, once a second."""
-        every = np.array(looks.points_mm, np.float32, order="C")
+        every = np.array(views.points_mm, np.float32, order="C")
         rotations, along = self._rotations, list(_ALONG)
         if again:
             rotations, along = rotations[::2], along[:1]
-        centres = self._centres(looks, rotations, along)
+        centres = self._centres(views, rotations, along)
         rotations = np.repeat(rotations, len(along), axis=0)
         beyond = self.prior.as_stated.excludes(rotations)
         for count, widths_mm, share in _STAGES:
             points_mm = every[:: max(1, len(every) // count)][:count].copy()
             costs = _POINTS_COST * self.descend(points_mm, widths_mm, rotations, centres)
-            if looks.evidence is not None:
-                costs += looks.evidence.rigid_costs(self.rest, rotations, centres)
+            if views.evidence is not None:
+                costs += views.evidence.rigid_costs(self.rest, rotations, centres)
             best = np.concatenate([_least(costs, group, share) for group in (~beyond, beyond)])
             rotations, centres, beyond = rotations[best], centres[best], beyond[best]
         most, others = (_KEPT_AGAIN, 1) if again else (_KEPT, _KEPT_BEYOND)
-        others = most if self.prior.either_side else others
+        others = most if self.prior.allow_flip else others
         return [
             *self._apart(rotations[~beyond], centres[~beyond], most),
             *self._apart(rotations[beyond], centres[beyond], others),
@@ -204,17 +204,17 @@ class Search:
         return middles[drawn] - self.rest.body.center_ct, normals[drawn] / area[drawn, None]
 
     def _centres(
-        self, looks: Looks, rotations: Rotations, shares: Sequence[float]
+        self, views: MultiViewCloud, rotations: Rotations, shares: Sequence[float]
     ) -> Float64[np.ndarray, "t 3"]:
         """Where the organ's centre is if the middle of what a camera sees of it lies in the middle
         of the points; and shifted along the organ: a part of it may be hidden."""
-        middle_mm = np.median(looks.points_mm, axis=0).astype(float)
+        middle_mm = np.median(views.points_mm, axis=0).astype(float)
         places, normals = self._surface
         weights = np.zeros((len(rotations), len(places)))
-        for number, pose in enumerate(looks.camera_from_look):
+        for number, pose in enumerate(views.camera_from_view):
             ray = unit(middle_mm - pose[:3, 3])
             towards = rotations.transpose(0, 2, 1) @ ray
-            depth_mm, shown_mm = towards @ places.T, looks.points_mm[looks.look == number] @ ray
+            depth_mm, shown_mm = towards @ places.T, views.points_mm[views.view == number] @ ray
             # The deeper part of an organ that reaches farther than the points do is not shown. By
             # their nearer half, since what lies behind them may be background.
             reach_mm = _REACH * np.ptp(np.percentile(shown_mm, _NEARER_HALF))
@@ -236,7 +236,7 @@ def _least(
     return mine[np.argsort(costs[mine])[: max(1, round(share * len(mine)))]]
 
 
-def apart_mm(other: ElasticMotion, motion: ElasticMotion) -> float:
+def distance_mm(other: ElasticMotion, motion: ElasticMotion) -> float:
     """About how far the poses have the centre, or a point 50 mm from it, apart."""
     turned = 50 * np.abs(other.rotation - motion.rotation).max()
     return float(max(turned, np.abs(other.centre_mm - motion.centre_mm).max()))
@@ -244,10 +244,10 @@ def apart_mm(other: ElasticMotion, motion: ElasticMotion) -> float:
 
 def far_from(motion: ElasticMotion, others: Iterable[ElasticMotion]) -> bool:
     """Whether a fit from there may end in another minimum than fits from each of the others."""
-    return all(apart_mm(motion, other) > APART_MM for other in others)
+    return all(distance_mm(motion, other) > APART_MM for other in others)
 
 
-def turned_starts(fitted: ElasticMotion, moved: Float64[np.ndarray, " 6"]) -> list[Start]:
+def turned_starts(fitted: ElasticMotion, pose_offset: Float64[np.ndarray, " 6"]) -> list[Start]:
     """Turned both ways about each principal axis of the turn's covariance; shift and coefficients
     follow as they are correlated with the turn. ``moved``: as in ``Start``, of the fit."""
     covariance = fitted.covariance
@@ -264,5 +264,5 @@ def turned_starts(fitted: ElasticMotion, moved: Float64[np.ndarray, " 6"]) -> li
                 centre_mm=fitted.centre_mm + fitted.rotation @ off[:3],
                 coefficients=fitted.coefficients + off[6:],
             )
-            starts.append(Start(motion, moved + off[:6]))
+            starts.append(Start(motion, pose_offset + off[:6]))
     return starts

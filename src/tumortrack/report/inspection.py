@@ -93,15 +93,15 @@ def _json(path: Path) -> list[str]:
 def _with_figures(content: Content, folder: Path) -> Content:
     """The entries of a file, and what is computed from them."""
     figures: dict[str, Any] = {}
-    if "up_lps" in content or "familiar" in content:
+    if "up_lps" in content or "in_distribution" in content:
         about = content.get("provenance", content)
         figures["weak"] = [
-            weakness.words for weakness in findings_in(about.get("warnings"), str(folder))
+            weakness.message for weakness in findings_in(about.get("warnings"), str(folder))
         ]
     if "up_lps" in content:  # a case
         figures["lies"] = _poses(content["rotations"], content["tilt_degrees"])
         figures |= _of_the_cases_model(folder)
-    elif "familiar" in content:  # a model
+    elif "in_distribution" in content:  # a model
         pose = content["config"]["scene"]["pose"]
         figures["lies"] = _poses(pose["rotations"], pose["tilt_deg"])
         method = "labels" if "network" in content["config"] else "registers"
@@ -145,12 +145,12 @@ def _of_the_cases_model(case: Path) -> Content:
 
 def _of_model(manifest: Content, folder: Path) -> Content:
     from tumortrack.assessment.bound_factor import read_factor
-    from tumortrack.io.model_folder import training_words, weakness_of
+    from tumortrack.io.model_folder import reliability_warning, training_words
 
     about, found = manifest["provenance"], read_factor(folder)
     trained = "trained for " * ("network" in manifest["config"])
-    known = {"known": trained + training_words(about), "weakness": weakness_of(about)}
-    return known if found is None else {**known, "factor_words": found.words}
+    known = {"known": trained + training_words(about), "weakness": reliability_warning(about)}
+    return known if found is None else {**known, "factor_words": found.message}
 
 
 def _artifact(folder: Path) -> Iterable[str]:
@@ -292,7 +292,7 @@ def _points(path: Path) -> list[str]:
 def _noise(content: Any) -> list[str]:
     from tumortrack.segmentation.measured_noise import noise_of
 
-    return [noise.words] if (noise := noise_of(content)) else []
+    return [noise.message] if (noise := noise_of(content)) else []
 
 
 def _size(box_mm: Any) -> str:

@@ -22,9 +22,9 @@ from tumortrack.tracking.options import LocateOptions, check_grid, model_folder
 from tumortrack.tracking.views import (
     NO_CLOUD,
     OrganInView,
-    View,
+    ViewFile,
     as_fitted,
-    further_looks,
+    further_views,
     read_places,
     read_views,
 )
@@ -110,7 +110,7 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
     tracker = Tracker(model, options.advise)
     about: dict[str, Any] = {
         "notes": [
-            *(weakness.words for weakness in model.warnings),
+            *(weakness.message for weakness in model.warnings),
             *_notes(views, points, tracker.anatomy_ct, options),
         ],
         "input": [],
@@ -123,12 +123,12 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
     try:
         found.extend(view.organ(model, options, hints) for view in views)
         organs = [organ.cloud for organ in found]
-        looks = further_looks(organs, views, fixed_from_camera)
+        others = further_views(organs, views, fixed_from_camera)
         estimate = tracker.locate(
             organs[0],
-            views=looks,
+            views=others,
             evidence=evidence,
-            seen=views[0].content,
+            full_view=views[0].content,
             grid=options.grid,
             seed=options.seed,
             frame=frame,
@@ -136,11 +136,13 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
     except NoEstimate as error:
         about["input"] = [organ.entry for organ in found]
         about = {**_no_estimate(error, views[0], model, options), **about}
-        seen = replace(seen, cloud=found[0].cloud, taken=found[0].taken) if found else seen
+        seen = (
+            replace(seen, cloud=found[0].cloud, pixel_class=found[0].pixel_class) if found else seen
+        )
         return Located(None, about, seen, points, error)
     found = as_fitted(views, found, estimate, model)
     about["input"] = [organ.entry for organ in found]
-    seen = replace(seen, cloud=found[0].cloud, taken=found[0].taken)
+    seen = replace(seen, cloud=found[0].cloud, pixel_class=found[0].pixel_class)
     if estimate.quality == "poor" and views[0].unit is not None:
         doubt = f"if that is not the organ, or not all of it: {_ASK}; --whole takes all."
         about["notes"].append(doubt)
@@ -152,9 +154,9 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
             "nobody says how well this camera is calibrated (--depth-error; of depth images also "
             "depth_left_mm in the intrinsics file)."
         )
-    if options.poses is not None and estimate.report.looks is not None:
-        about["looks"] = {
-            **to_builtins(estimate.report.looks),
+    if options.poses is not None and estimate.report.views is not None:
+        about["views"] = {
+            **to_builtins(estimate.report.views),
             "frame_id": frame_id,
             "fixed_from_camera": fixed_from_camera[0].tolist(),
             "poses_sha256": store.sha256_of(options.poses),
@@ -188,7 +190,7 @@ def _points(given: Path, folder: Path, options: LocateOptions) -> PointTable | N
 
 
 def _notes(
-    views: list[View],
+    views: list[ViewFile],
     points: PointTable | None,
     anatomy_ct: Anatomy | None,
     options: LocateOptions,
@@ -203,7 +205,7 @@ def _notes(
 
 
 def _no_estimate(
-    error: NoEstimate, view: View, model: Model, options: LocateOptions
+    error: NoEstimate, view: ViewFile, model: Model, options: LocateOptions
 ) -> dict[str, Any]:
     """The first entries of a report without an estimate."""
     from tumortrack.io.run_folder import finding_entry, report_head

@@ -207,7 +207,7 @@ def write_page(report: dict[str, Any], scenes: list[dict[str, Any]], path: Path)
         _section(
             "Errors by verdict, beside rigid registration, mm: median / 95 % within / worst",
             _table(of_errors.head, of_errors.rows),
-            rule=f"{_RULES['errors']} {_rivals(report)}",
+            rule=f"{_RULES['errors']} {_baselines(report)}",
         ),
         _section(
             "All scenes",
@@ -244,7 +244,7 @@ def _about(entry: dict[str, Any]) -> dict[str, Any]:
         for name, part in entry["parts"].items()
     ]
     return {
-        "name": ": ".join(filter(None, (entry["name"], entry.get("words")))),
+        "name": ": ".join(filter(None, (entry["name"], entry.get("message")))),
         "verdict": entry["quality"],
         "color": colours.css(colours.VERDICTS[entry["quality"]]),
         "reason": reason,
@@ -252,18 +252,18 @@ def _about(entry: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _rivals(report: dict[str, Any]) -> str:
-    from tumortrack.report.summary import RIVALS
+def _baselines(report: dict[str, Any]) -> str:
+    from tumortrack.report.summary import BASELINES
 
-    meaning = report["rivals"]
+    meaning = report["baselines"]
     if "not_available" in meaning:
         return str(meaning["not_available"])
-    sentences = [f"{RIVALS[name].capitalize()}: {meaning[name]}." for name in RIVALS]
+    sentences = [f"{BASELINES[name].capitalize()}: {meaning[name]}." for name in BASELINES]
     missing = {
-        entry["name"]: rival["not_available"]
+        entry["name"]: baseline["not_available"]
         for entry in report["scenes"]
-        for rival in entry["rivals"].values()
-        if "not_available" in rival
+        for baseline in entry["baselines"].values()
+        if "not_available" in baseline
     }
     return " ".join([*sentences, *(f"Not available of {n}: {why}." for n, why in missing.items())])
 
@@ -299,12 +299,14 @@ def write_run_page(
         known = [
             [
                 f"{each.name} {number}", each.tool, f"{each.off_mm:.1f} mm",
-                f"{100 * each.news:.0f} %",
-                "left out: it contradicts the rest" if each.left_out else "",
+                f"{100 * each.information_gain:.0f} %",
+                "left out: it contradicts the rest" if each.rejected else "",
             ]
             for number, each in enumerate(estimate.report.evidence, start=1)
         ]  # fmt: skip
-        body.append(_section("", _table(["evidence", "tool", "off", "news", ""], known)))
+        body.append(
+            _section("", _table(["evidence", "tool", "off", "information_gain", ""], known))
+        )
     body += map(_figures, (views, slices))
     banner = colours.VERDICTS[verdict]
     rows_of_panels = [views, *pictures.in_fours(slices)]
@@ -321,7 +323,7 @@ def _lines(report: dict[str, Any], estimate: Estimate | None) -> Iterator[str]:
     yield f"{patient}. {axes}."
     if estimate is not None and estimate.assessment.factor != 1.0:
         yield f"{_sentence(estimate.assessment.factor_words)}."
-    yield from (view["words"] for view in report.get("input", ()))
+    yield from (view["message"] for view in report.get("input", ()))
     yield from (f"Note: {note}" for note in report.get("notes", ()))
     if estimate is not None:
         yield from map(_sentence, seen.other_lines(estimate))

@@ -222,17 +222,19 @@ def _section(
     return Image.fromarray(image)
 
 
-def depth_picture(frame: DepthFrame, taken: UInt8[np.ndarray, "h w"] | None = None) -> Image.Image:
+def depth_picture(
+    frame: DepthFrame, pixel_class: UInt8[np.ndarray, "h w"] | None = None
+) -> Image.Image:
     """Near is bright, no return is black; what was ``taken`` for the organ has its colour."""
-    depth_mm = frame.depth_mm if taken is None else frame.depth_mm[sampled_pixels(frame)]
+    depth_mm = frame.depth_mm if pixel_class is None else frame.depth_mm[sampled_pixels(frame)]
     (height, width), known = depth_mm.shape, np.isfinite(depth_mm)
     grey = np.zeros((height, width))
     if known.any():
         low, high = np.quantile(depth_mm[known], (0.01, 0.95))
         grey[known] = 235 - 190 * np.clip((depth_mm[known] - low) / max(high - low, 1.0), 0, 1)
     picture: np.ndarray = np.repeat(grey[..., None], 3, axis=2)
-    if taken is not None:
-        organ = known & (taken == ORGAN)
+    if pixel_class is not None:
+        organ = known & (pixel_class == ORGAN)
         picture[organ] = 0.5 * picture[organ] + 0.5 * np.array(colours.part_colour(1))
     image = Image.fromarray(picture.astype(np.uint8))
     return image.resize((round(440 * width / height), 440))
@@ -254,10 +256,10 @@ def run_panels(estimate: Estimate | None, seen: Seen) -> tuple[list[Panel], list
     """What the camera saw and the surfaces from three sides; and two slices through each tumor."""
     views, slices = list[Panel](), list[Panel]()
     if isinstance(seen.content, DepthFrame):
-        taken = "; tinted: taken for the organ" if seen.taken is not None else ""
+        pixel_class = "; tinted: taken for the organ" if seen.pixel_class is not None else ""
         size = f"{seen.content.intrinsics.width} x {seen.content.intrinsics.height} pixels"
-        caption = f"depth image, {size}, near is bright{taken}"
-        views.append((caption, depth_picture(seen.content, seen.taken)))
+        caption = f"depth image, {size}, near is bright{pixel_class}"
+        views.append((caption, depth_picture(seen.content, seen.pixel_class)))
     points_mm = _thinned(seen.cloud if estimate and seen.cloud else seen.content)
     meshes, structures = ({}, {}) if estimate is None else (estimate.meshes, estimate.structures)
     for mesh in (*meshes.values(), *structures.values()):
@@ -286,7 +288,7 @@ def _slice(estimate: Estimate, seen: Seen, part: str, way: str) -> Image.Image:
     assert plane is not None  # an estimate with that part, and its organ
     ground = None
     if seen.ct is not None and estimate.motion is not None:
-        back = estimate.motion.back(plane.points(_SLICE // 2))
+        back = estimate.motion.inverse(plane.points(_SLICE // 2))
         ground = None if back is None else seen.ct.picture(back)
     return _section(plane, ground, estimate.meshes, estimate.structures, cloud=seen.cloud)
 

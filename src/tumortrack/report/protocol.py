@@ -20,8 +20,8 @@ from tumortrack.core.store import read_json, write_json, writing
 from tumortrack.io.scene_folder import Scene, list_scenes, read_scene
 from tumortrack.registration.base_model import Model
 from tumortrack.report import metrics
-from tumortrack.report.rivals import rivals_of
-from tumortrack.report.summary import MEANING, NO_RIVALS, RULE, summarise, worst_center
+from tumortrack.report.baselines import baselines_of
+from tumortrack.report.summary import MEANING, NO_BASELINES, RULE, summarise, worst_center
 from tumortrack.tracking.model_files import load_model
 from tumortrack.tracking.options import model_folder
 from tumortrack.tracking.tracker import Tracker
@@ -58,8 +58,8 @@ def evaluate_model(
         "seed": seed,
     }
     locate = partial(model.locate, grid=grid, seed=seed)
-    rivals, threads = rivals_of(model.model), min(available_cores(), _THREADS)
-    return evaluate_scenes(locate, scenes_dir, out, progress, about, rivals, threads)
+    baselines, threads = baselines_of(model.model), min(available_cores(), _THREADS)
+    return evaluate_scenes(locate, scenes_dir, out, progress, about, baselines, threads)
 
 
 def check_case(model: Model, folders: list[Path]) -> None:
@@ -84,7 +84,7 @@ def evaluate_scenes(
     out: Path,
     progress: Callable[[], None] = lambda: None,
     about: dict[str, Any] | None = None,
-    rivals: Compare | None = None,
+    baselines: Compare | None = None,
     threads: int = 1,
 ) -> dict[str, Any]:
     """Evaluate ``locate`` on every scene of a folder; OUT gets report.json, scenes/NAME.png and
@@ -96,7 +96,7 @@ def evaluate_scenes(
             has none, which counts as a failed scene. Gets ``evidence=`` of scenes that have some.
         progress: called after each scene.
         about: plain JSON for the report: the model and options behind ``locate``.
-        rivals: rigid registration of a scene, see ``report.rivals.Rivals``.
+        baselines: rigid registration of a scene, see ``report.baselines.Baselines``.
         threads: scenes at once; over 1 only if ``locate`` may be called by several.
 
     Raises:
@@ -110,11 +110,11 @@ def evaluate_scenes(
 
     def judged(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         scene = read_scene(folder)
-        entry, estimate = evaluate_scene(locate, scene, folder.name, rivals)
+        entry, estimate = evaluate_scene(locate, scene, folder.name, baselines)
         if isinstance(stated := scene.meta.get("registration"), dict):  # of a second CT
             entry["registration_mm"] = stated.get("tre_mm", {})
         if isinstance(said := scene.meta.get("words"), str):
-            entry["words"] = said
+            entry["message"] = said
         meshes = estimate.meshes if estimate else {}
         picture = out / "scenes" / f"{folder.name}.png"
         scene_picture(scene, meshes, entry, picture)
@@ -134,7 +134,7 @@ def evaluate_scenes(
             "units": "mm",
             "frame": "camera",
             **(about or {}),
-            "rivals": MEANING if rivals is not None else {"not_available": NO_RIVALS},
+            "baselines": MEANING if baselines is not None else {"not_available": NO_BASELINES},
             "rule": RULE,
             "summary": summarise(entries),
             "scenes": entries,
@@ -170,9 +170,9 @@ def check_place(out: Path, overwrite: bool) -> None:
     entries = [entry for entry in report["scenes"] if isinstance(entry, dict)]
     pictures = {f"{entry.get('name')}.png" for entry in entries}
     drawn = {path.name for path in (out / "scenes").glob("*")}
-    if strays := sorted((inside - _OURS) | (drawn - pictures)):
+    if outliers := sorted((inside - _OURS) | (drawn - pictures)):
         raise InputError(
-            f"{out} also holds {', '.join(strays[:3])}, which no report has; --overwrite would "
+            f"{out} also holds {', '.join(outliers[:3])}, which no report has; --overwrite would "
             "lose it. Move it away first, or choose another path."
         )
 
@@ -188,7 +188,7 @@ def clear(out: Path) -> None:
 
 
 def evaluate_scene(
-    locate: Locate, scene: Scene, name: str, rivals: Compare | None = None
+    locate: Locate, scene: Scene, name: str, baselines: Compare | None = None
 ) -> tuple[dict[str, Any], Estimate | None]:
     """One scene's entry: name, quality (good, poor or none) and its reason, parts -> metrics, miou,
     seconds, timings, and failed (or null).
@@ -204,7 +204,7 @@ def evaluate_scene(
         verdict = {"quality": "none", "reason": str(error), "failed": str(error)}
         entry = {"name": name, "parts": parts, "miou": 0.0, **verdict}
         entry |= {} if scene.targets is None else {"tre_mm": None}
-        return entry | ({} if rivals is None else {"rivals": rivals(scene)}), None
+        return entry | ({} if baselines is None else {"baselines": baselines(scene)}), None
     seconds = time.perf_counter() - start
     parts = compare(estimate, scene)
     entry = {
@@ -219,9 +219,9 @@ def evaluate_scene(
     }
     if estimate.motion is not None and scene.targets is not None:
         entry["tre_mm"] = metrics.target_errors(
-            estimate.motion.carry(scene.targets.points_ct), scene.targets
+            estimate.motion.forward(scene.targets.points_ct), scene.targets
         )
-    entry |= {} if rivals is None else {"rivals": rivals(scene)}
+    entry |= {} if baselines is None else {"baselines": baselines(scene)}
     return entry, estimate
 
 

@@ -62,7 +62,7 @@ class SceneErrors(Value, frozen=True, kw_only=True):
     miou: float
     seconds: float | None = None
     targets: TargetErrors | None = msgspec.field(name="tre_mm", default=None)
-    rivals: dict[str, RigidErrors] = {}
+    baselines: dict[str, RigidErrors] = {}
 
 
 class Spread(Value, frozen=True, kw_only=True):

@@ -28,13 +28,13 @@ class Seen:
     Attributes:
         cloud: the organ's points, in which it was located.
         content: all that the camera saw.
-        taken: class of each pixel of a depth image (``segmentation.Region``); 0: the organ.
+        pixel_class: class of each pixel of a depth image (``segmentation.Region``); 0: the organ.
         ct: for slices of the CT, moved to the organ; without it, slices show labels.
     """
 
     cloud: SensorCloud | None = None
     content: DepthFrame | SensorCloud | None = None
-    taken: UInt8[np.ndarray, "h w"] | None = None
+    pixel_class: UInt8[np.ndarray, "h w"] | None = None
     ct: CarriedCt | None = None
 
 
@@ -63,8 +63,8 @@ def other_lines(estimate: Estimate) -> list[str]:
     cost = estimate.report.fit_cost
     first = {each.kind: each for each in reversed(_next_evidence(estimate))}.values()
     best = min(first, key=lambda each: each.then_bound_mm or np.inf, default=None)
-    lines = [other.words for other in (() if cost is None else cost.others)]
-    return lines + ([] if best is None else [f"next, {best.words}"])
+    lines = [other.message for other in (() if cost is None else cost.others)]
+    return lines + ([] if best is None else [f"next, {best.message}"])
 
 
 def _next_evidence(estimate: Estimate) -> tuple[NextEvidence, ...]:
@@ -77,7 +77,7 @@ def _next_evidence(estimate: Estimate) -> tuple[NextEvidence, ...]:
 def spots(estimate: Estimate) -> Iterator[tuple[Point, colours.Colour]]:
     """Where evidence lies, and where to touch next."""
     for each in estimate.report.evidence:
-        colour = colours.NONE if each.left_out else colours.WHITE
+        colour = colours.NONE if each.rejected else colours.WHITE
         yield from ((place_mm, colour) for place_mm in each.places_mm)
     touches = (each for each in _next_evidence(estimate) if each.kind == "touch")
     yield from ((each.place_mm, colours.TO_CUT) for each in touches)

@@ -69,7 +69,7 @@ def _export_case(
 ) -> tuple[str, ...]:
     """Adds the case to the scene and writes what else was asked for; notes."""
     labels, patient = case.labels, case.patient
-    parts = segments(case.anatomy.names, patient.side, case.anatomy.kind)
+    parts = segments(case.anatomy.names, patient.side, case.anatomy.organ_kind)
     file = aside / "case.seg.nrrd"
     write_seg_nrrd(file, labels.labels, labels.lps_from_index, parts)
     for name, mesh in case.anatomy.structures.items():
@@ -101,7 +101,7 @@ def _report_with_motion(run: Path, case: Case, folder: Path) -> dict[str, Any]:
         raise InputError(f"{run} was not located with a model of {folder}: give its case.")
     if "motion" not in report:
         raise InputError(
-            f"{run} does not know where the CT is now: a model of the preset clinic does. "
+            f"{run} does not know where the CT is now: a model of the preset elastic does. "
             "Export it alone: tumortrack export RUN OUT."
         )
     return report

@@ -23,9 +23,9 @@ RULE = (
     f"over {FAR_MM:g} mm off, whether the answer is called good or poor; where nothing was found "
     "its mIoU is 0 and its target errors are infinite."
 )
-NO_RIVALS = (
-    "Rigid registration is left out: it needs the organ at rest, which models of the preset clinic "
-    "alone keep; a function that estimates states none."
+NO_BASELINES = (
+    "Rigid registration is left out: it needs the organ at rest, which models of the preset "
+    "elastic alone keep; a function that estimates states none."
 )
 MEANING = {
     "best_rigid_pose": "an oracle: the undeformed organ, moved onto the true one as well as rigid "
@@ -41,8 +41,8 @@ COLUMNS = {
     "surface_mm": "surface off in the mean, mm",
     "iou": "overlap (IoU, 0 to 1)",
 }
-RIVALS = {"best_rigid_pose": "best rigid pose", "rigid_fit": "rigid fit"}
-METHODS = {"estimate": "estimate", **RIVALS}
+BASELINES = {"best_rigid_pose": "best rigid pose", "rigid_fit": "rigid fit"}
+METHODS = {"estimate": "estimate", **BASELINES}
 # Of the two that a surgeon asks for; the third is of targets, where a scene has some.
 MEASURES = {"center_mm": "centre", "hausdorff_mm": "surface", "target_mm": "targets"}
 
@@ -62,7 +62,7 @@ def summarise(entries: list[Entry]) -> dict[str, Any]:
     """The report's summary; docs/conventions.md lists its fields.
 
     For each part medians, ``worst`` and ``p95`` over scenes; ``errors``: of ``all``, ``good`` and
-    ``poor`` answers, the errors of the estimate and its rivals, pooled over scenes, tumors and
+    ``poor`` answers, the errors of the estimate and its baselines, pooled over scenes, tumors and
     targets, the worst with its scene and part. A part that was not found is infinitely far: null.
     """
     summary: dict[str, Any] = {}
@@ -152,7 +152,7 @@ def _answer(entry: Entry, method: str) -> dict[str, Any]:
     """A method's errors of the judged parts and of targets."""
     if method == "estimate":
         return {**entry, "parts": judged_parts(entry["parts"])}
-    return dict(entry.get("rivals", {}).get(method, {}))
+    return dict(entry.get("baselines", {}).get(method, {}))
 
 
 def _spread(values: list[float], worst: tuple[float, str, str]) -> dict[str, Any]:
@@ -202,11 +202,11 @@ def spread_words(spread: dict[str, Any]) -> str:
 
 
 def headlines(summary: dict[str, Any]) -> list[str]:
-    """Errors of good answers, of poor ones and of the rivals, pooled over all scenes, tumors and
+    """Errors of good answers, of poor ones and of the baselines, pooled over all scenes, tumors and
     targets."""
     groups = summary["errors"]
     named = {verdict: groups.get(verdict, {}).get("estimate", {}) for verdict in ("good", "poor")}
-    named |= {name: groups.get("all", {}).get(rival, {}) for rival, name in RIVALS.items()}
+    named |= {name: groups.get("all", {}).get(baseline, {}) for baseline, name in BASELINES.items()}
     return [f"{name}: {line}" for name, group in named.items() for line in measures(group)]
 
 
@@ -239,7 +239,7 @@ def error_table(summary: dict[str, Any]) -> Table:
         if method in group
     ]
     known = "best_rigid_pose" in summary["errors"].get("all", {})
-    caption = "; ".join(f"{RIVALS[name]}: {text}" for name, text in MEANING.items())
+    caption = "; ".join(f"{BASELINES[name]}: {text}" for name, text in MEANING.items())
     title = "errors in mm: median / 95 % within / worst, over all scenes and tumors"
     return Table(title, ["answers", "method", *MEASURES.values()], rows, caption if known else "")
 
@@ -268,8 +268,13 @@ def scene_table(entries: list[Entry]) -> Table:
     rows, pairs = [], list[bool]()
     for entry in entries:
         far_mm, part = worst_center(entry)
-        rigid_mm = rival_center(entry, "rigid_fit", part)
-        row = [entry["name"], entry.get("words", ""), entry["quality"], number(_finite(far_mm), 1)]
+        rigid_mm = baseline_center(entry, "rigid_fit", part)
+        row = [
+            entry["name"],
+            entry.get("message", ""),
+            entry["quality"],
+            number(_finite(far_mm), 1),
+        ]
         row.append("-" if rigid_mm is None else number(rigid_mm, 1))
         errors = entry.get("tre_mm")
         rows.append([*row, *[number(errors["mean"], 1) if errors else "-"] * targets])
@@ -283,9 +288,9 @@ def scene_table(entries: list[Entry]) -> Table:
     return Table("", head, rows, caption)
 
 
-def rival_center(entry: Entry, rival: str, part: str) -> float | None:
+def baseline_center(entry: Entry, baseline: str, part: str) -> float | None:
     """How far off that rigid registration has the middle of a part, mm; None: it was not done."""
-    parts = entry.get("rivals", {}).get(rival, {}).get("parts", {})
+    parts = entry.get("baselines", {}).get(baseline, {}).get("parts", {})
     return parts[part]["center_mm"] if part in parts else None
 
 

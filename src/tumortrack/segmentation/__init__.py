@@ -51,8 +51,8 @@ class Region:
         cloud: at most ``crop.n_points`` of its points, drawn at random; camera frame, mm.
         counts: number of working-image pixels that are ``organ``, had ``no return``, or were
             removed by each step (``working_image.STEPS``).
-        taken: (h, w) uint8, the same for each pixel of the working image: index into ``STEPS``, 0
-            the organ. Of a cloud as seen by a camera at its origin.
+        pixel_class: (h, w) uint8, the same for each pixel of the working image: index into
+            ``STEPS``, 0 the organ. Of a cloud as seen by a camera at its origin.
         seconds: run time.
         doubt: why the colours learnt from clicks were not used, so that depth alone decided; or
             empty.
@@ -61,7 +61,7 @@ class Region:
 
     cloud: SensorCloud
     counts: dict[str, int]
-    taken: np.ndarray
+    pixel_class: np.ndarray
     seconds: float
     doubt: str = ""
     noise: DepthNoise | None = None
@@ -94,14 +94,14 @@ def organ_points(
         remove_plane(image, config, rng)
     if config.flying:
         remove_flying(image, config)
-    possible = image.remaining(image.taken)
+    possible = image.remaining(image.pixel_class)
     others: list[np.ndarray] = []
     if config.pieces:
         window, part = image.cropped()
         others = [_pixels_of(image, window, mask) for mask in choose_pieces(part, config, hints)]
-        image.taken[window] = part.taken
+        image.pixel_class[window] = part.pixel_class
     counts = image.counts()
-    remaining = image.remaining(image.taken)
+    remaining = image.remaining(image.pixel_class)
     if noise is not None and hints.noise is None and isinstance(content, DepthFrame):
         noise = _noise_there(content, image, remaining, noise)
     if len(remaining) < FEWEST_POINTS:
@@ -110,7 +110,7 @@ def organ_points(
         values: dict[str, float | str | None] = {
             "points": len(remaining),
             "fewest": FEWEST_POINTS,
-            "pixels": image.taken.size,
+            "pixels": image.pixel_class.size,
             "steps": steps or "nothing",
             "near_mm": near,
             "far_mm": far,
@@ -136,7 +136,7 @@ def organ_points(
     cloud = cloud_of(remaining)
     more = [cloud_of(pixels) for pixels in others if len(pixels) >= FEWEST_POINTS]
     cloud = replace(cloud, others=tuple(more))
-    return Region(cloud, counts, image.taken, time.perf_counter() - start, doubt, noise)
+    return Region(cloud, counts, image.pixel_class, time.perf_counter() - start, doubt, noise)
 
 
 def _image_of(
@@ -193,9 +193,9 @@ def _noise_where(frame: DepthFrame, there: np.ndarray) -> DepthNoise | None:
 
 def _pixels_of(image: WorkingImage, window: Any, mask: np.ndarray) -> np.ndarray:
     """Of a piece in a window of the image, as ``WorkingImage.remaining`` has them."""
-    taken = np.full_like(image.taken, PIECES)
-    taken[window] = np.where(mask, ORGAN, PIECES)
-    return image.remaining(taken)
+    pixel_class = np.full_like(image.pixel_class, PIECES)
+    pixel_class[window] = np.where(mask, ORGAN, PIECES)
+    return image.remaining(pixel_class)
 
 
 def _as_noisy(config: RegionConfig, noise: DepthNoise, window_px: int) -> RegionConfig:
@@ -209,13 +209,13 @@ def _remove_other_tissue(
 ) -> str:
     """Remove what the colours learnt from clicks rule out. Returns why they can't be used on this
     frame, or an empty string."""
-    if hints.taught is None:
+    if hints.tissue_classifier is None:
         return ""
     colours = None
     if hints.picture is not None and isinstance(content, DepthFrame):
         colours = colours_of(content, hints.picture)
     try:
-        image.remove(hints.taught.other_tissue(image, colours), COLOUR)
+        image.remove(hints.tissue_classifier.other_tissue(image, colours), COLOUR)
     except NoEstimate as error:
         return f"what the clicks taught is not used: {error}"
     return ""

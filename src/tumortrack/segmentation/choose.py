@@ -27,7 +27,7 @@ _SPLITS = (False, 1.0), (True, 1.0), (True, 1.7), (True, 2.8)
 _CLEARLY = 1.1  # a wider opening must raise the score by this factor
 _PICK_REACH_MM = 10.0  # from the picked point to its piece
 _OTHERS, _LEAST_OTHER = 3, 0.1  # pieces that may be it instead; score over the best of them
-_CUT = 0.1  # ``_Sizes.cut`` from which a piece leaves the image
+_MOST_ON_BORDER = 0.1  # ``_Sizes.cut`` from which a piece leaves the image
 _POOR = 0.5  # likeness of an organ below which a guess is doubtful
 _WHOLLY = 0.97  # share of a piece in the last box from which it is part of the organ
 _BOX_MM = 5.0  # tolerance of the last box
@@ -95,14 +95,14 @@ def choose_pieces(image: WorkingImage, config: RegionConfig, hints: Hints) -> li
 
 class _Sizes(NamedTuple):
     """Measures of every piece (count + 1,); entry 0 is not used. ``area_mm2``: across the line of
-    sight. ``wide_mm``: the longest extent along four directions of the image. ``cut``: 0..1, how
-    much of it continues outside the examined part: the width there over the square root of the
-    area. ``thick_mm``: diameter of its largest inscribed disc. ``aside``: tangent of the angle
-    between its middle and the optical axis."""
+    sight. ``wide_mm``: the longest extent along four directions of the image. ``border_fraction``:
+    0..1, how much of it continues outside the examined part: the width there over the square root
+    of the area. ``thick_mm``: diameter of its largest inscribed disc. ``aside``: tangent of the
+    angle between its middle and the optical axis."""
 
     area_mm2: np.ndarray
     wide_mm: np.ndarray
-    cut: np.ndarray
+    border_fraction: np.ndarray
     thick_mm: np.ndarray
     aside: np.ndarray
 
@@ -121,7 +121,7 @@ def _chosen(
     leaves the image, is too wide, or less like an organ than ``poor`` beside something larger that
     leaves the image."""
     likeness = _like_an_organ(sizes, config)
-    chosen = np.zeros(len(sizes.cut), bool)
+    chosen = np.zeros(len(sizes.border_fraction), bool)
     piece = _hinted(image, pieces, sizes, hints)
     guessed = piece is None
     if guessed:
@@ -129,7 +129,7 @@ def _chosen(
         if not scores.max() > 0:
             return chosen, -1.0, True
         piece = int(scores.argmax())
-    leaves = sizes.cut > _CUT
+    leaves = sizes.border_fraction > _MOST_ON_BORDER
     chosen[piece] = True
     score = sizes.area_mm2[piece] * likeness[piece]
     too_wide = sizes.wide_mm[piece] > config.organ_mm[1]
@@ -155,7 +155,7 @@ def _hinted(image: WorkingImage, pieces: np.ndarray, sizes: _Sizes, hints: Hints
     if hints.last_box_mm is None:
         return None
     low, high = np.sort(np.asarray(hints.last_box_mm, np.float64), axis=0)
-    area = area_inside(image, pieces, low, high, len(sizes.cut))
+    area = area_inside(image, pieces, low, high, len(sizes.border_fraction))
     inside = area**2 / np.maximum(sizes.area_mm2, 1e-9)  # the surroundings reach in, too
     return int(inside.argmax()) if inside.max() > 0 else None
 
@@ -166,7 +166,7 @@ def _like_an_organ(sizes: _Sizes, config: RegionConfig) -> np.ndarray:
     fits = np.minimum(1.0, (high / np.maximum(sizes.wide_mm, 1e-9)) ** 4)
     thick = np.minimum(1.0, sizes.thick_mm / (_THICK * low)) ** 2
     aimed = 1 / (1 + (sizes.aside / _AIMED) ** 2)
-    return fits * thick * aimed * (1 - 0.95 * sizes.cut) ** 4 * (sizes.wide_mm > low)
+    return fits * thick * aimed * (1 - 0.95 * sizes.border_fraction) ** 4 * (sizes.wide_mm > low)
 
 
 def area_inside(
@@ -183,6 +183,6 @@ def measure(image: WorkingImage, distance: np.ndarray, pieces: np.ndarray, count
     """``distance``: px to the nearest edge."""
     out = np.empty((count + 1, 17))
     camera = *image.tangents, *image.pinhole[:2]
-    _measures(image.depth_mm, distance, image.taken, pieces, *camera, LAST_BOX, out)
-    area, _, _, _, _, thick, wide, cut, aside = out.T[:9]
-    return _Sizes(area, wide, cut, thick, aside)
+    _measures(image.depth_mm, distance, image.pixel_class, pieces, *camera, LAST_BOX, out)
+    area, _, _, _, _, thick, wide, border_fraction, aside = out.T[:9]
+    return _Sizes(area, wide, border_fraction, thick, aside)

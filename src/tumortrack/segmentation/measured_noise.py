@@ -67,7 +67,7 @@ class DepthNoise(NamedTuple):
         return float(np.sqrt(self.white_mm**2 / pixels + shared))
 
     @property
-    def words(self) -> str:
+    def message(self) -> str:
         """As a clause."""
         at = f"{self.whole_mm:.2g} mm at {self.depth_mm:.0f} mm"
         if self.bound:
@@ -115,10 +115,10 @@ def cloud_noise(cloud: SensorCloud) -> DepthNoise | None:
     """Of a cloud of any density; None: it has too few points."""
     if len(cloud.points_mm) < 2 * _NEIGHBOURS:
         return None
-    points, middles, apart_mm2 = _around(cloud)
-    apart_mm = float(np.sqrt(np.median(np.partition(apart_mm2, 1, axis=1)[:, 1])))
+    points, middles, distance_mm2 = _around(cloud)
+    distance_mm = float(np.sqrt(np.median(np.partition(distance_mm2, 1, axis=1)[:, 1])))
     while True:
-        near = np.argpartition(apart_mm2, _NEIGHBOURS, axis=1)[:, :_NEIGHBOURS]
+        near = np.argpartition(distance_mm2, _NEIGHBOURS, axis=1)[:, :_NEIGHBOURS]
         local = points[near] - middles[:, None]
         _, left = local_quadratics(local)
         variances = np.sum(left**2, axis=1) / (_NEIGHBOURS - TERMS)
@@ -128,9 +128,9 @@ def cloud_noise(cloud: SensorCloud) -> DepthNoise | None:
         # Neighbours within little more than the noise have no direction of a surface.
         if reach_mm > _WIDER * white_mm or len(points) < 4 * _NEIGHBOURS:
             break
-        points, apart_mm2 = points[::2], apart_mm2[:, ::2]
+        points, distance_mm2 = points[::2], distance_mm2[:, ::2]
     at_mm = float(np.median(points[:, 2]))
-    return DepthNoise(white_mm, 0.0, 0.0, 0.0, at_mm, apart_mm > _SPARSE_MM)
+    return DepthNoise(white_mm, 0.0, 0.0, 0.0, at_mm, distance_mm > _SPARSE_MM)
 
 
 def local_quadratics(
@@ -150,11 +150,11 @@ def local_quadratics(
 
 
 def scattered_share(cloud: SensorCloud) -> float:
-    """The share of the points that have few neighbours: about that of strays."""
+    """The share of the points that have few neighbours: about that of outliers."""
     if len(cloud.points_mm) < 2 * _NEIGHBOURS:
         return 0.0
-    _, _, apart_mm2 = _around(cloud)
-    reach_mm2 = np.partition(apart_mm2, CROWD, axis=1)[:, CROWD]
+    _, _, distance_mm2 = _around(cloud)
+    reach_mm2 = np.partition(distance_mm2, CROWD, axis=1)[:, CROWD]
     return float(np.mean(reach_mm2 > (LONELY**2) * np.median(reach_mm2)))
 
 
@@ -257,10 +257,10 @@ def _left_of(along: Float[np.ndarray, "side side"], side: int) -> Float[np.ndarr
         a = (one, slice(None)) if axis == 0 else (slice(None), one)
         b = (two, slice(None)) if axis == 0 else (slice(None), two)
         before = along[h, 0] * along[0, 0]
-        taken = np.einsum("ijt,ijt->ij", grid[a], spread[b])
-        taken += np.einsum("ijt,ijt->ij", spread[a], grid[b])
+        pixel_class = np.einsum("ijt,ijt->ij", grid[a], spread[b])
+        pixel_class += np.einsum("ijt,ijt->ij", spread[a], grid[b])
         back = np.einsum("ijt,ts,ijs->ij", grid[a], inner, grid[b])
-        return before - taken + back
+        return before - pixel_class + back
 
     own = covariance(0, 0)
     lags = _LAGS[: side // 2 - 1]

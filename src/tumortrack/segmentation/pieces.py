@@ -46,8 +46,8 @@ def _jump(image: WorkingImage, config: RegionConfig) -> Jump:
 
 def remove_flying(image: WorkingImage, config: RegionConfig) -> None:
     """Remove pixels with few neighbours at their depth: between two surfaces, or isolated."""
-    isolated = np.empty(image.taken.shape, np.bool_)
-    find_isolated(image.depth_mm, image.taken, _jump(image, config), isolated)
+    isolated = np.empty(image.pixel_class.shape, np.bool_)
+    find_isolated(image.depth_mm, image.pixel_class, _jump(image, config), isolated)
     image.remove(isolated, FLYING)
 
 
@@ -58,7 +58,7 @@ def find_edges(
     (h, w) of every pixel to the nearest edge, px. ``folds``: are edges, too."""
     jump = _jump(image, config)
     depth_mm = np.empty_like(image.depth_mm)
-    bridge_holes(image.depth_mm, image.taken, jump, depth_mm)
+    bridge_holes(image.depth_mm, image.pixel_class, jump, depth_mm)
     height, width = depth_mm.shape
     distance = np.empty((height + 2, width + 2), np.float32)
     crease = config.crease_mm * folds, _CREASE_REACH_MM / image.footprint
@@ -77,5 +77,5 @@ def find_pieces(
     radius = wider * config.opening_mm / image.footprint  # px at distance 1
     pieces, count = label(distance * depth_mm > radius)
     grow_pieces(depth_mm, pieces, _jump(image, config), radius, np.empty(pieces.size, np.int32))
-    pieces[image.taken != ORGAN] = 0  # bridged holes
+    pieces[image.pixel_class != ORGAN] = 0  # bridged holes
     return pieces, count

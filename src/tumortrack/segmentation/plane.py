@@ -60,7 +60,7 @@ def remove_plane(image: WorkingImage, config: RegionConfig, rng: np.random.Gener
         (x, y, z), offset, half_mm = plane[:3]
         (height, width), (fx, fy, cx, cy) = image.depth_mm.shape, image.pinhole
         right, down = x * (np.arange(width) - cx) / fx, y * (np.arange(height) - cy) / fy + z
-        _remove_below(image.depth_mm, image.taken, right, down, offset, half_mm, PLANE)
+        _remove_below(image.depth_mm, image.pixel_class, right, down, offset, half_mm, PLANE)
 
 
 def find_plane(image: WorkingImage, config: RegionConfig, rng: np.random.Generator) -> Plane | None:
@@ -107,7 +107,9 @@ def _sampled_points(image: WorkingImage, far_mm: float, rng: np.random.Generator
     height, width = image.depth_mm.shape
     pixel = rng.integers(height * width, size=3 * _SAMPLED)
     z = image.depth_mm.ravel()[pixel]
-    valid = np.flatnonzero((image.taken.ravel()[pixel] != NO_RETURN) & (z < far_mm))[:_SAMPLED]
+    valid = np.flatnonzero((image.pixel_class.ravel()[pixel] != NO_RETURN) & (z < far_mm))[
+        :_SAMPLED
+    ]
     row, column = np.divmod(pixel[valid], width)
     (fx, fy, cx, cy), z = image.pinhole, z[valid]
     return np.stack([(column - cx) / fx * z, (row - cy) / fy * z, z], axis=1).astype(np.float32)

@@ -94,7 +94,7 @@ def _without_scattered(cloud: SensorCloud, share: float) -> SensorCloud:
     from scipy.spatial import cKDTree
 
     points_mm = thin_cloud(cloud, _MOST_POINTS, np.random.default_rng(0)).points_mm
-    for _ in range(2):  # a stray's neighbours may be strays
+    for _ in range(2):  # a stray's neighbours may be outliers
         reach_mm = cKDTree(points_mm).query(points_mm, CROWD + 1)[0][:, -1]
         points_mm = points_mm[reach_mm < LONELY * np.quantile(reach_mm, 0.5 * (1 - share))]
     return replace(cloud, points_mm=points_mm)
@@ -107,12 +107,12 @@ def _smoothed(cloud: SensorCloud, noise: DepthNoise) -> tuple[SensorCloud, Point
     points_mm = thin_cloud(cloud, _MOST_POINTS, rng).points_mm.astype(float)
     tree, drawn = cKDTree(points_mm), points_mm[:_SMOOTHED]
     wanted = int(np.clip(TERMS / 2 * (noise.white_mm / _LEFT_MM) ** 2, *_NEIGHBOURS))
-    apart_mm, near = tree.query(drawn, min(wanted, len(points_mm)))
-    count = int(np.median((apart_mm < _RADIUS_MM).sum(1)))
+    distance_mm, near = tree.query(drawn, min(wanted, len(points_mm)))
+    count = int(np.median((distance_mm < _RADIUS_MM).sum(1)))
     if count < 2 * TERMS:
         return cloud, noise.of_points(len(cloud.points_mm))
     off_mm, _ = local_quadratics(points_mm[near[:, :count]] - drawn[:, None])
-    off_mm[apart_mm[:, count - 1] > 2 * _RADIUS_MM] = 0.0  # too sparse there
+    off_mm[distance_mm[:, count - 1] > 2 * _RADIUS_MM] = 0.0  # too sparse there
     white_mm = noise.white_mm * np.sqrt(TERMS / 2 / count)
     mean_mm = noise.white_mm / np.sqrt(len(points_mm))
     left = PointNoise(noise.white_mm, float(white_mm), float(mean_mm))

@@ -70,7 +70,7 @@ class TissueClassifier:
             raise NoEstimate(Finding("no_picture"))
         features, usable = _features(image, colours)
         height, width = usable.shape
-        remaining = image.taken[: 2 * height : 2, : 2 * width : 2] == ORGAN
+        remaining = image.pixel_class[: 2 * height : 2, : 2 * width : 2] == ORGAN
         usable &= remaining
         odds, known = np.zeros(usable.shape, np.float32), np.zeros(usable.shape, np.float32)
         odds[usable], known[usable] = self.log_odds(features[usable])
@@ -80,7 +80,7 @@ class TissueClassifier:
             raise NoEstimate(Finding("no_organ_colour"))
         # What has no colour, such as highlights, takes the class of its surroundings.
         fine, wide = (_mean([odds], known, mm / block_mm)[0] for mm in (_FINE_MM, _FILL_MM))
-        other = np.zeros(image.taken.shape, bool)
+        other = np.zeros(image.pixel_class.shape, bool)
         blocks = _large(np.where(usable, fine, wide) < 0, _SPECK_MM2 / block_mm**2)
         other[: 2 * height, : 2 * width] = blocks.repeat(2, axis=0).repeat(2, axis=1)
         return other
@@ -106,8 +106,8 @@ class Hints:
         picked_mm: a point on the organ, camera frame; selects the piece. Organs move: once there is
             an estimate, give its box instead.
         last_box_mm: lower and upper corner of the last estimate's organ, camera frame.
-        picture: colour or grey image in the depth image's pixels, for ``taught``.
-        taught: tells the organ from other tissue by colour. None: only geometry counts.
+        picture: colour or grey image in the depth image's pixels, for ``tissue_classifier``.
+        tissue_classifier: tells the organ from other tissue by colour. None: only geometry counts.
         noise: of this camera, as an earlier frame showed it; None: it is measured.
     """
 
@@ -115,7 +115,7 @@ class Hints:
     picked_mm: Float[np.ndarray, " 3"] | None = None
     last_box_mm: Float[np.ndarray, "2 3"] | None = None
     picture: UInt8[np.ndarray, "h w *rgb"] | None = None
-    taught: TissueClassifier | None = None
+    tissue_classifier: TissueClassifier | None = None
     noise: DepthNoise | None = None
 
 
@@ -150,7 +150,7 @@ def sample_click(frame: DepthFrame, picture: Colours, pixel: tuple[int, int], or
     return Click(organ, features[near])
 
 
-def teach(clicks: Sequence[Click]) -> TissueClassifier:
+def train_tissue_classifier(clicks: Sequence[Click]) -> TissueClassifier:
     """The classifier that clicks, in any order, give. Raises InputError: too few clicks of a kind,
     or kinds that look alike."""
     clicks = sorted(clicks, key=lambda click: (click.organ, *click.features.mean(0, dtype=float)))

@@ -71,7 +71,7 @@ class TableWatch:
         if self._moved:
             raise NoEstimate(self._moved)
         if self._hidden > _HIDDEN_CHECKS:
-            return "the table is hidden, so nobody notices if the camera moves; uncover it"
+            return "the table is hidden, so camera motion cannot be detected; uncover it"
         if self._known is not None and self._table is None:
             return "the calibration's table is not found: does the camera still stand there?"
         return ""

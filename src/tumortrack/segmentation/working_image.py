@@ -123,7 +123,7 @@ class WorkingImage:
     """
 
     depth_mm: np.ndarray
-    taken: np.ndarray
+    pixel_class: np.ndarray
     pinhole: Pinhole
     remaining: Callable[[np.ndarray], np.ndarray]
     points: Callable[[np.ndarray], np.ndarray]
@@ -150,24 +150,27 @@ class WorkingImage:
 
     def remove(self, where: np.ndarray, step: int) -> None:
         """Mark pixels (h, w, bool) as removed by a step, except those already removed."""
-        self.taken[where & (self.taken == ORGAN)] = step
+        self.pixel_class[where & (self.pixel_class == ORGAN)] = step
 
     def cropped(self) -> tuple[tuple[slice, slice], WorkingImage]:
         """The rows and columns of the remaining pixels, with one more to each side, and a copy of
         that part; its ``taken`` must be written back."""
         rows = columns = slice(0, 1)
-        organ = self.taken == ORGAN
+        organ = self.pixel_class == ORGAN
         if organ.any():
             ends = (np.flatnonzero(organ.any(axis))[[0, -1]].tolist() for axis in (1, 0))
             rows, columns = (slice(max(first - 1, 0), last + 2) for first, last in ends)
         fx, fy, cx, cy = self.pinhole
         pinhole = Pinhole(fx, fy, cx - columns.start, cy - rows.start)
-        depth_mm, taken = self.depth_mm[rows, columns].copy(), self.taken[rows, columns].copy()
-        part = WorkingImage(depth_mm, taken, pinhole, self.remaining, self.points)
+        depth_mm, pixel_class = (
+            self.depth_mm[rows, columns].copy(),
+            self.pixel_class[rows, columns].copy(),
+        )
+        part = WorkingImage(depth_mm, pixel_class, pinhole, self.remaining, self.points)
         return (rows, columns), part
 
     def counts(self) -> dict[str, int]:
-        counts = np.bincount(self.taken.ravel(), minlength=len(STEPS))
+        counts = np.bincount(self.pixel_class.ravel(), minlength=len(STEPS))
         return dict(zip(STEPS, counts.tolist(), strict=True))
 
 
@@ -190,7 +193,7 @@ def image_of_frame(
         depth_mm = smoothed(frame, sampled, noise, reach)
     else:
         depth_mm = frame.depth_mm[sampled].copy()
-    taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
+    pixel_class = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
 
     def points(pixel: np.ndarray) -> np.ndarray:
         z_mm = depth_mm.ravel()[pixel].astype(np.float64)
@@ -201,10 +204,10 @@ def image_of_frame(
     cx, cy = (camera.cx - step // 2) / step, (camera.cy - step // 2) / step
     pinhole = Pinhole(camera.fx / step, camera.fy / step, cx, cy)
 
-    def remaining(taken: np.ndarray) -> np.ndarray:
-        return np.flatnonzero(taken == ORGAN)
+    def remaining(pixel_class: np.ndarray) -> np.ndarray:
+        return np.flatnonzero(pixel_class == ORGAN)
 
-    image = WorkingImage(depth_mm, taken, pinhole, remaining, points, step, reach)
+    image = WorkingImage(depth_mm, pixel_class, pinhole, remaining, points, step, reach)
     if mask is not None:
         if mask.shape != frame.depth_mm.shape:
             raise InputError(
@@ -230,14 +233,14 @@ def image_of_cloud(cloud: SensorCloud) -> WorkingImage:
     depth_mm = np.full((height, width), np.nan, np.float32)
     pixel = np.empty(len(z), np.int32)
     rasterise(tangents, z, pinhole, depth_mm, pixel)
-    taken = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
+    pixel_class = np.isnan(depth_mm).view(np.uint8) * np.uint8(NO_RETURN)
 
-    def remaining(taken: np.ndarray) -> np.ndarray:
+    def remaining(pixel_class: np.ndarray) -> np.ndarray:
         index = np.flatnonzero(pixel >= 0)
-        index = index[taken.ravel()[pixel[index]] == ORGAN]
+        index = index[pixel_class.ravel()[pixel[index]] == ORGAN]
         return index[z[index] - depth_mm.ravel()[pixel[index]] < 2 + 2 * size * z[index]]
 
-    return WorkingImage(depth_mm, taken, pinhole, remaining, lambda index: points_mm[index])
+    return WorkingImage(depth_mm, pixel_class, pinhole, remaining, lambda index: points_mm[index])
 
 
 def tangents_of(points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -251,4 +254,4 @@ def tangents_of(points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def keep_inside(image: WorkingImage, corners_mm: np.ndarray, step: int) -> None:
     """Remove everything outside a box: two corners (2, 3), camera frame, mm, in any order."""
     low, high = np.sort(np.asarray(corners_mm, np.float64), axis=0)
-    _keep_inside(image.depth_mm, image.taken, *image.tangents, low, high, step)
+    _keep_inside(image.depth_mm, image.pixel_class, *image.tangents, low, high, step)

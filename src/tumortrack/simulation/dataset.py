@@ -30,7 +30,7 @@ def scene_maker(case: Case, config: SceneConfig, seed: int) -> Callable[[int], S
             "camera_from_ct": made.camera_from_ct.tolist(),
             "deformation": made.deformation.record(),
         }
-        targets = inner.at(made.carry(inner.points_ct))
+        targets = inner.at(made.forward(inner.points_ct))
         return Scene(made.cloud, simulator.reference(made), made.frame, meta, targets)
 
     return make

@@ -142,7 +142,7 @@ class RenderedScene:
     frame: DepthFrame
     cloud: SensorCloud
 
-    def carry(self, points_ct: Points) -> Points:
+    def forward(self, points_ct: Points) -> Points:
         """Points of the undeformed CT in the camera frame."""
         return transform_points(self.camera_from_ct, self.deformation.apply(points_ct))
 
@@ -171,8 +171,10 @@ class Simulator:
 
     def reference(self, scene: RenderedScene) -> Anatomy:
         """The anatomy as it lies in the scene, camera frame."""
-        parts = (part.moved(scene.carry(part.vertices_mm)) for part in self.anatomy_ct.parts)
-        return self.anatomy_ct.of(parts)
+        parts = (
+            part.with_vertices(scene.forward(part.vertices_mm)) for part in self.anatomy_ct.parts
+        )
+        return self.anatomy_ct.with_parts(parts)
 
     def draw(self, recipe: SceneRecipe) -> tuple[RenderedScene, np.random.Generator]:
         """``render``, and the recipe's generator, for what else is drawn of the scene."""

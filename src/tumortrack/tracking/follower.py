@@ -14,12 +14,12 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.evidence import Evidence
-from tumortrack.core.geometry import HERE, Affine, transform_points
+from tumortrack.core.geometry import IDENTITY, Affine, transform_points
 from tumortrack.core.report import Likely
-from tumortrack.core.types import DepthFrame, Look, SensorCloud
+from tumortrack.core.types import DepthFrame, SensorCloud, View
 from tumortrack.tracking.tracker import Tracker, seen_from
 
-# For so long after a good estimate the organ is also searched for upside down. In first looks, that
+# For so long after a good estimate the organ is also searched for upside down. In first views, that
 # search called 18 of 46 kidneys of other patients, or mirrored ones, good; none without it.
 _TURNED_OVER_S = 30.0
 # Causes are searched for at most this often for each failed check, as that takes several frames.
@@ -79,7 +79,7 @@ class Follower:
         self._last, self._at_rest, self._scanned_ns = estimate, True, estimate.cloud.stamp_ns
 
     def last_box_mm(
-        self, stamp_ns: int, camera_from_last: Affine = HERE
+        self, stamp_ns: int, camera_from_last: Affine = IDENTITY
     ) -> Float64[np.ndarray, "2 3"] | None:
         """The organ's box in the last estimate, if that is recent enough; camera frame.
         ``camera_from_last``: from the camera frame of that estimate."""
@@ -87,36 +87,36 @@ class Follower:
         if last is None:
             return None
         organ = last.organ_mesh
-        if camera_from_last is not HERE:
-            organ = organ.moved(transform_points(camera_from_last, organ.vertices_mm))
+        if camera_from_last is not IDENTITY:
+            organ = organ.with_vertices(transform_points(camera_from_last, organ.vertices_mm))
         return organ.box_mm
 
     def locate(
         self,
         cloud: SensorCloud,
-        seen: DepthFrame | SensorCloud | None = None,
+        full_view: DepthFrame | SensorCloud | None = None,
         *,
-        views: Sequence[Look] = (),
+        views: Sequence[View] = (),
         evidence: Sequence[Evidence] = (),
-        camera_from_last: Affine = HERE,
+        camera_from_last: Affine = IDENTITY,
     ) -> Estimate:
         """The estimate of this frame. ``views``: of further cameras; ``evidence``: what became
         known with it, beside what was known before; ``camera_from_last``: as in ``last_box_mm``.
         Raises NoEstimate, as ``Tracker.follow``; the last estimate is then dropped, but not the
         evidence."""
         last, self._last, self._at_rest = self._recent(cloud.stamp_ns), None, False
-        if last is not None and camera_from_last is not HERE:
+        if last is not None and camera_from_last is not IDENTITY:
             last = seen_from(last, camera_from_last)
         earlier = () if last is not None else self._earlier(cloud.stamp_ns, camera_from_last)
-        thorough = (cloud.stamp_ns - self._scanned_ns) * 1e-9 >= self._config.rescan_s
-        if last is None or thorough:
+        global_search = (cloud.stamp_ns - self._scanned_ns) * 1e-9 >= self._config.rescan_s
+        if last is None or global_search:
             self._scanned_ns = cloud.stamp_ns
         since_ns = np.inf if self._good_ns is None else cloud.stamp_ns - self._good_ns
         if not 0 <= (cloud.stamp_ns - self._causes_ns) * 1e-9 < _CAUSES_EVERY_S:
             self._causes_ns, self._causes = cloud.stamp_ns, {}
         how = FollowOptions(
-            thorough=thorough,
-            either_side=bool(0 <= since_ns <= _TURNED_OVER_S * 1e9),
+            global_search=global_search,
+            allow_flip=bool(0 <= since_ns <= _TURNED_OVER_S * 1e9),
             smoothing_s=self._config.smoothing_s,
             seed=self._config.seed,
             known=self._causes,
@@ -124,7 +124,7 @@ class Follower:
         )
         try:
             self._last = self._tracker.follow(
-                cloud, last, how, seen, views=views, evidence=evidence
+                cloud, last, how, full_view, views=views, evidence=evidence
             )
         except NoEstimate as error:
             if error.causes:
@@ -149,7 +149,7 @@ class Follower:
         """Evidence of before the organ was lost."""
         if not 0 <= (stamp_ns - self._known_ns) * 1e-9 <= _REMEMBERED_S:
             return ()
-        if camera_from_last is HERE:
+        if camera_from_last is IDENTITY:
             return self._known
         return tuple(each.seen_from(camera_from_last) for each in self._known)
 

@@ -29,7 +29,7 @@ from tumortrack.registration.base_model import Model
 from tumortrack.registration.in_distribution import InDistributionRange
 from tumortrack.registration.method import method_of_folder
 from tumortrack.registration.model import RegistrationModel
-from tumortrack.tracking.presets import clinic, seen_by
+from tumortrack.tracking.presets import elastic, seen_by
 
 if TYPE_CHECKING:
     from tumortrack.registration.config import RegistrationConfig
@@ -55,7 +55,7 @@ def load_model(folder: Path, device: str = "auto") -> Model:
         known = {
             "parts": _parts(manifest["parts"], organ_of(manifest, folder)),
             "in_distribution": from_builtins(
-                manifest["familiar"], InDistributionRange, f"{folder}: familiar"
+                manifest["in_distribution"], InDistributionRange, f"{folder}: in_distribution"
             ),
             "provenance": dict(manifest["provenance"]),
             "bound_factor": 1.0 if (found := read_factor(folder)) is None else found.factor,
@@ -151,7 +151,7 @@ def make_model(
     provenance = {
         "case_sha256": case.sha256,
         "patient": to_builtins(case.patient),
-        "organ": organ_entry(case.anatomy.kind),
+        "organ": organ_entry(case.anatomy.organ_kind),
         "warnings": msgspec.to_builtins(case.warnings),
     }
     more = {} if progress is None else {"progress": progress}
@@ -159,7 +159,7 @@ def make_model(
 
 
 def _config_of(case: Case) -> RegistrationConfig:
-    return seen_by(clinic(case.anatomy, case.rotations, case.tilt_degrees), case.sensor)
+    return seen_by(elastic(case.anatomy, case.rotations, case.tilt_degrees), case.sensor)
 
 
 def _parts(stated: list[str], organ: Organ) -> tuple[str, ...]:

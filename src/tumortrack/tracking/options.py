@@ -101,12 +101,12 @@ class LocateOptions(RegionOptions):
         intrinsics: JSON with width, height, fx, fy, cx, cy in pixels: once for all views, or once
             for each, in their order.
         evidence: JSON or CSV with what else is known of where the organ lies: touched points,
-            landmarks, outlines (docs/evidence.md). Needs a model of preset clinic.
+            landmarks, outlines (docs/evidence.md). Needs a model of preset elastic.
         advise: part for which it says what to learn next (default: the tumor that is least sure).
         map: points of the CT to map to the camera frame (OUT/points.csv): a .csv with columns
-            x,y,z (LPS, mm), or 3D Slicer's .mrk.json or .fcsv. Needs a model of preset clinic.
+            x,y,z (LPS, mm), or 3D Slicer's .mrk.json or .fcsv. Needs a model of preset elastic.
         case: the model's case; the page's slices then show its CT moved to the organ (preset
-            clinic). Takes a second or two longer.
+            elastic). Takes a second or two longer.
         device: auto takes CUDA if there is a GPU.
     """
 

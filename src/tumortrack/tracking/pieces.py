@@ -11,26 +11,26 @@ from tumortrack.assessment.sight import log_likelihood
 from tumortrack.core.assessment import deciding
 from tumortrack.core.errors import NoEstimate, NotThisOrgan
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.types import DepthFrame, Look
+from tumortrack.core.types import DepthFrame, View
 
 _UNDETERMINED = 2.0  # times the radius that makes an answer poor
-_ELSEWHERE = "fit", "strays", "seen_through", "size"  # checks that speak for another piece
+_ELSEWHERE = "fit", "outliers", "seen_through", "size"  # checks that speak for another piece
 
 
 def likeliest_piece(
-    looks: Sequence[Look], located: Callable[[Sequence[Look]], Estimate], most: int | None = None
-) -> tuple[Estimate, Sequence[Look]]:
-    """The estimate in the first look's points or, where these are not the organ, in another piece
-    of its image (``SensorCloud.others``, up to ``most``); and the looks with that piece.
+    views: Sequence[View], located: Callable[[Sequence[View]], Estimate], most: int | None = None
+) -> tuple[Estimate, Sequence[View]]:
+    """The estimate in the first view's points or, where these are not the organ, in another piece
+    of its image (``SensorCloud.others``, up to ``most``); and the views with that piece.
     ``located``: finds and judges it. Raises NotThisOrgan: none is the organ."""
-    found: list[tuple[Estimate, Sequence[Look]]] = []
+    found: list[tuple[Estimate, Sequence[View]]] = []
     first: NotThisOrgan | None = None
-    main, start_s = looks[0], time.perf_counter()
-    alone = main.seen is main.cloud
+    main, start_s = views[0], time.perf_counter()
+    alone = main.full_view is main.cloud
     for number, cloud in enumerate((main.cloud, *main.cloud.others[:most])):
-        tried: Sequence[Look] = (
-            replace(main, cloud=cloud, seen=cloud if alone else main.seen),
-            *looks[1:],
+        tried: Sequence[View] = (
+            replace(main, cloud=cloud, full_view=cloud if alone else main.full_view),
+            *views[1:],
         )
         try:
             estimate = located(tried).reporting(piece=number)
@@ -65,12 +65,12 @@ def _sure(estimate: Estimate) -> bool:
     return not _doubted(estimate) and max(bounds_mm, default=0.0) < _UNDETERMINED * POOR_MM
 
 
-def _likelihood(found: tuple[Estimate, Sequence[Look]]) -> tuple[bool, float]:
+def _likelihood(found: tuple[Estimate, Sequence[View]]) -> tuple[bool, float]:
     """Whether it is sure; and of the image with the organ there. Of a cloud the points that do not
     stray are counted."""
-    estimate, (look, *_) = found
-    if isinstance(look.seen, DepthFrame):
-        return _sure(estimate), log_likelihood(estimate.organ_mesh, look)
+    estimate, (view, *_) = found
+    if isinstance(view.full_view, DepthFrame):
+        return _sure(estimate), log_likelihood(estimate.organ_mesh, view)
     cost = estimate.report.fit_cost
-    strays = 0.0 if cost is None else cost.strays
-    return _sure(estimate), len(look.cloud.points_mm) * (1 - strays)
+    outliers = 0.0 if cost is None else cost.outliers
+    return _sure(estimate), len(view.cloud.points_mm) * (1 - outliers)

@@ -1,4 +1,4 @@
-"""The presets by name: `clinic` registers the CT's organ, `quick` and `paper` classify points."""
+"""The presets by name: `elastic` registers the CT's organ, `quick` and `paper` classify points."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.renamed import attributes_of
 from tumortrack.core.types import Anatomy
 from tumortrack.registration.base_model import ModelConfig
-from tumortrack.registration.config import Rotations, clinic
+from tumortrack.registration.config import Rotations, elastic
 from tumortrack.registration.method import Preset, method_of_preset
 from tumortrack.simulation.noise import CLEAN, SENSORS, Sensor
 
@@ -18,7 +18,7 @@ C = TypeVar("C", bound=ModelConfig)
 
 if not TYPE_CHECKING:
     __getattr__ = attributes_of("tumortrack.presets")
-__all__ = ["PRESETS", "clinic", "paper", "quick", "seen_by"]
+__all__ = ["PRESETS", "elastic", "paper", "quick", "seen_by"]
 
 
 def quick(anatomy: Anatomy, rotations: Rotations = "limited") -> Any:
@@ -31,7 +31,7 @@ def paper(anatomy: Anatomy, rotations: Rotations = "limited") -> Any:
     return method_of_preset("paper").presets["paper"](anatomy, rotations)
 
 
-PRESETS: dict[str, Preset] = {"clinic": clinic, "quick": quick, "paper": paper}
+PRESETS: dict[str, Preset] = {"elastic": elastic, "quick": quick, "paper": paper}
 
 
 def seen_by(config: C, sensor: Sensor) -> C:

@@ -20,9 +20,9 @@ from tumortrack.core.config import check_seed
 from tumortrack.core.errors import InputError, NotThisOrgan
 from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.evidence import CAMERA, Evidence, touched
-from tumortrack.core.geometry import HERE, Affine, rigid, transform_points
-from tumortrack.core.process import keep_small_blocks
-from tumortrack.core.types import Anatomy, DepthFrame, Look, SensorCloud
+from tumortrack.core.geometry import IDENTITY, Affine, rigid, transform_points
+from tumortrack.core.process import tune_malloc
+from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud, View
 from tumortrack.io.case import Case
 from tumortrack.registration.base_model import Model
 from tumortrack.registration.evidence import EvidenceTerms
@@ -59,7 +59,7 @@ class Tracker:
                 f"Tracker takes a case or a model, not {type(model).__name__}: "
                 "Tracker(load_case(FOLDER))."
             )
-        keep_small_blocks()
+        tune_malloc()
         self.model, self._locator = model, _locator(model)
         if advise and not isinstance(model, RegistrationModel):
             raise InputError("advice needs a model that knows a motion: give the case itself.")
@@ -74,9 +74,9 @@ class Tracker:
         self,
         points: SensorCloud | Float[np.ndarray, "n 3"],
         *,
-        views: Sequence[Look] = (),
+        views: Sequence[View] = (),
         evidence: Sequence[Evidence] = (),
-        seen: DepthFrame | SensorCloud | None = None,
+        full_view: DepthFrame | SensorCloud | None = None,
         grid: int = 160,
         seed: int = 0,
         frame: str = CAMERA,
@@ -89,7 +89,8 @@ class Tracker:
             evidence: what else is known of where it lies then: ``Touch``, ``Landmark``, ``Held``,
                 ``Outline``, ``Free``, in the frame of ``points``. There may be no points: then it
                 has twelve places or more, touched or outlined.
-            seen: all that the camera saw, by which the estimate is judged; default: ``points``.
+            full_view: all that the camera saw, by which the estimate is judged; default:
+            ``points``.
             grid: voxels along the longest side of the labelled volume.
             seed: of the random points.
             frame: without points: of the evidence, and of the answer; in another one than a
@@ -104,11 +105,11 @@ class Tracker:
         """
         check_seed(seed)
         cloud = cloud_of(points)
-        looks: Sequence[Look]
-        looks, pieces = _looks_of(cloud, seen, views), _evidence_of(evidence)
+        all_views: Sequence[View]
+        all_views, pieces = _looks_of(cloud, full_view, views), _evidence_of(evidence)
         if frame != CAMERA:
             return replace(self._located_in_frame(cloud, pieces, grid, seed), frame=frame)
-        return self._located(cloud, looks, pieces, grid, seed)
+        return self._located(cloud, all_views, pieces, grid, seed)
 
     def _located_in_frame(
         self, cloud: SensorCloud, pieces: Sequence[Evidence], grid: int, seed: int
@@ -118,13 +119,15 @@ class Tracker:
             raise InputError("clouds are in a camera's frame; only evidence without one is not.")
         away_mm = _BEFORE_MM - np.concatenate([each.places for each in pieces]).mean(0)
         moved = [each.at(np.array(each.places) + away_mm, each.std_mm) for each in pieces]
-        found = self._located(cloud, (Look(cloud, cloud, HERE),), tuple(moved), grid, seed, True)
+        found = self._located(
+            cloud, (View(cloud, cloud, IDENTITY),), tuple(moved), grid, seed, True
+        )
         return _shifted(found, -away_mm)
 
     def _located(
         self,
         cloud: SensorCloud,
-        looks: Sequence[Look],
+        all_views: Sequence[View],
         pieces: tuple[Evidence, ...],
         grid: int,
         seed: int,
@@ -134,25 +137,25 @@ class Tracker:
         shown, given = tuple[Evidence, ...](), pieces
         if not len(cloud.points_mm) and pieces:
             alone, shown, pieces = touched(pieces, self.model.parts[0])
-            looks = (Look(replace(alone, stamp_ns=cloud.stamp_ns), cloud, HERE),)
+            all_views = (View(replace(alone, stamp_ns=cloud.stamp_ns), cloud, IDENTITY),)
 
-        def located(looks: Sequence[Look]) -> Estimate:
-            found = self._locator.locate(looks, grid, seed, pieces, any_pose)
+        def located(all_views: Sequence[View]) -> Estimate:
+            found = self._locator.locate(all_views, grid, seed, pieces, any_pose)
             found = _with_pieces(found, shown, given)
-            return judged(found, looks, factor=self.model.bound_factor)
+            return judged(found, all_views, factor=self.model.bound_factor)
 
-        with self._explaining_errors(looks, _DEFAULTS, bool(pieces)):
-            estimate, looks = likeliest_piece(looks, located)
-        return assessed(estimate, looks, self.model, advise="all", part=self._advised)
+        with self._explaining_errors(all_views, _DEFAULTS, bool(pieces)):
+            estimate, all_views = likeliest_piece(all_views, located)
+        return assessed(estimate, all_views, self.model, advise="all", part=self._advised)
 
     def follow(
         self,
         cloud: SensorCloud,
         last: Estimate | None = None,
         how: FollowOptions = _DEFAULTS,
-        seen: DepthFrame | SensorCloud | None = None,
+        full_view: DepthFrame | SensorCloud | None = None,
         *,
-        views: Sequence[Look] = (),
+        views: Sequence[View] = (),
         evidence: Sequence[Evidence] = (),
     ) -> Estimate:
         """A fast estimate for one frame of many: without a volume, from a search that starts at the
@@ -160,30 +163,32 @@ class Tracker:
         what is new with this frame. Models that know no motion cannot smooth. Raises as ``locate``.
         """
         # A fit that is suddenly worse may be to another object.
-        strictly = how.either_side if last is None else last.quality != "good" or not _unusual(last)
-        looks: Sequence[Look]
-        looks, pieces = _looks_of(cloud, seen, views), _evidence_of(evidence)
+        strictly = how.allow_flip if last is None else last.quality != "good" or not _unusual(last)
+        all_views: Sequence[View]
+        all_views, pieces = _looks_of(cloud, full_view, views), _evidence_of(evidence)
         if pieces:
             how = msgspec.structs.replace(how, evidence=(*how.evidence, *pieces))
 
-        def located(looks: Sequence[Look]) -> Estimate:
-            found = self._locator.follow(looks, last, how)
-            return judged(found, looks, strictly, self.model.bound_factor, last)
+        def located(all_views: Sequence[View]) -> Estimate:
+            found = self._locator.follow(all_views, last, how)
+            return judged(found, all_views, strictly, self.model.bound_factor, last)
 
-        with self._explaining_errors(looks, how, bool(pieces or (last and last.evidence))):
-            estimate, looks = likeliest_piece(looks, located, most=1)  # a frame may not wait
-        advise: Advise = "touches" if how.thorough else "nothing"
-        return assessed(estimate, looks, self.model, how.known, advise, self._advised)
+        with self._explaining_errors(all_views, how, bool(pieces or (last and last.evidence))):
+            estimate, all_views = likeliest_piece(
+                all_views, located, most=1
+            )  # a frame may not wait
+        advise: Advise = "touches" if how.global_search else "nothing"
+        return assessed(estimate, all_views, self.model, how.known, advise, self._advised)
 
     @contextmanager
     def _explaining_errors(
-        self, looks: Sequence[Look], how: FollowOptions, touched: bool
+        self, all_views: Sequence[View], how: FollowOptions, touched: bool
     ) -> Iterator[None]:
         """Adds the likely causes to NotThisOrgan. ``touched``: evidence may be one of them."""
         try:
             yield
         except NotThisOrgan as error:
-            causes = causes_of(self.model, looks, None, how.known)
+            causes = causes_of(self.model, all_views, None, how.known)
             advice = f"{words(causes, '')}."
             if touched:
                 advice += " Or its evidence is of another place: try without it."
@@ -230,7 +235,8 @@ def _shifted(estimate: Estimate, by_mm: Float64[np.ndarray, " 3"]) -> Estimate:
         for each in estimate.assessment.next_evidence
     )
     structures = {
-        name: mesh.moved(mesh.vertices_mm + by_mm) for name, mesh in estimate.structures.items()
+        name: mesh.with_vertices(mesh.vertices_mm + by_mm)
+        for name, mesh in estimate.structures.items()
     }
     made = replace(made, volume=volume, structures=structures).assessed(next_evidence=advice)
     return made.reporting(parts=parts, evidence=evidence, motion=motion, fit_cost=cost)
@@ -244,7 +250,7 @@ def _with_pieces(
     motion = estimate.motion
     if not shown or not isinstance(motion, ElasticMotion):
         return estimate
-    terms = EvidenceTerms.of(shown, motion.shape.anatomy_ct.names, math.inf)
+    terms = EvidenceTerms.from_evidence(shown, motion.shape.anatomy_ct.names, math.inf)
     assert terms is not None
     told = terms.described(shown, motion, 0, terms.at(motion))
     rest, mine = iter(estimate.report.evidence), iter(told)
@@ -270,12 +276,12 @@ def cloud_of(points: SensorCloud | Float[np.ndarray, "n 3"]) -> SensorCloud:
 
 
 def _looks_of(
-    cloud: SensorCloud, seen: DepthFrame | SensorCloud | None, views: Sequence[Look]
-) -> tuple[Look, ...]:
+    cloud: SensorCloud, full_view: DepthFrame | SensorCloud | None, views: Sequence[View]
+) -> tuple[View, ...]:
     """The cloud's view, then the others."""
-    hint = "views=[Look(cloud, seen, camera_from_look)]; touches and the like are evidence=[...]"
-    others = _all_of(Look, views, "views are of Look", hint)
-    return tuple(map(_cleaned, (Look(cloud, seen or cloud, HERE), *others)))
+    hint = "views=[View(cloud, seen, camera_from_view)]; touches and the like are evidence=[...]"
+    others = _all_of(View, views, "views are of View", hint)
+    return tuple(map(_cleaned, (View(cloud, full_view or cloud, IDENTITY), *others)))
 
 
 def _evidence_of(evidence: Sequence[Evidence]) -> tuple[Evidence, ...]:
@@ -293,11 +299,13 @@ def _all_of(kind: Any, given: Any, what: str, hint: str) -> tuple[Any, ...]:
     return values
 
 
-def _cleaned(look: Look) -> Look:
+def _cleaned(view: View) -> View:
     """What was seen is cleaned with the organ's points where it is no more than these."""
-    others = tuple(map(clean_cloud, look.cloud.others))
-    cloud = replace(clean_cloud(look.cloud), others=others)
-    return replace(look, cloud=cloud, seen=cloud if look.seen is look.cloud else look.seen)
+    others = tuple(map(clean_cloud, view.cloud.others))
+    cloud = replace(clean_cloud(view.cloud), others=others)
+    return replace(
+        view, cloud=cloud, full_view=cloud if view.full_view is view.cloud else view.full_view
+    )
 
 
 def _locator(model: Model) -> Locator:
@@ -319,7 +327,9 @@ def seen_from(estimate: Estimate, camera_from_last: Affine) -> Estimate:
         for motion in (estimate.motion, estimate.unsmoothed)
     )
     cloud, meshes = replace(estimate.cloud, points_mm=points_mm), estimate.meshes.items()
-    moved = {n: m.moved(transform_points(camera_from_last, m.vertices_mm)) for n, m in meshes}
+    moved = {
+        n: m.with_vertices(transform_points(camera_from_last, m.vertices_mm)) for n, m in meshes
+    }
     evidence = tuple(each.seen_from(camera_from_last) for each in estimate.evidence)
     made = replace(estimate, cloud=cloud, meshes=moved, motion=motion, unsmoothed=unsmoothed)
     return replace(made, evidence=evidence)

@@ -16,7 +16,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import Affine
 from tumortrack.core.store import read_json
-from tumortrack.core.types import DepthFrame, Look, PointNoise, SensorCloud
+from tumortrack.core.types import DepthFrame, PointNoise, SensorCloud, View
 from tumortrack.io.depth_files import (
     CLOUD_SUFFIXES,
     DEPTH_SUFFIXES,
@@ -27,9 +27,9 @@ from tumortrack.io.depth_files import (
 )
 from tumortrack.registration.base_model import Model
 from tumortrack.registration.gauss_newton import FARTHEST
-from tumortrack.registration.looks import kernel_width_mm, lies_on
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion, seen_from_first
+from tumortrack.registration.multi_view import kernel_width_mm, lies_on
 from tumortrack.segmentation import Hints, organ_points
 from tumortrack.segmentation.measured_noise import noise_of
 from tumortrack.segmentation.working_image import ORGAN, PIECES, STEPS, THIN, image_of_frame
@@ -40,7 +40,7 @@ _NEAR = 3  # pixels from the one of --at
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class ViewFile:
     """The content of an input file of `locate`. ``unit``: of a depth image, mm per step and where
     that is stated; ``notes``: on what was dropped."""
 
@@ -88,8 +88,10 @@ class View:
         depth = isinstance(self.content, DepthFrame)
         noise = found.noise if depth else noise_of(self.content)
         entry |= {} if noise is None else {"noise": noise.entry}
-        last = "" if noise is None else f"; {noise.words}"
-        return OrganInView(found.cloud, entry, found.taken, (words, last)).with_pixels(found.taken)
+        last = "" if noise is None else f"; {noise.message}"
+        return OrganInView(found.cloud, entry, found.pixel_class, (words, last)).with_pixels(
+            found.pixel_class
+        )
 
     def fitted(
         self, found: OrganInView, motion: ElasticMotion, within_mm: float, piece: int
@@ -98,15 +100,15 @@ class View:
         pieces that lie on it are its own."""
         if piece:
             found = found._replace(cloud=found.cloud.others[piece - 1])
-        if found.taken is None or not isinstance(self.content, DepthFrame):
+        if found.pixel_class is None or not isinstance(self.content, DepthFrame):
             return found
-        taken = found.taken.copy()
+        pixel_class = found.pixel_class.copy()
         if piece:
-            taken[taken == ORGAN] = PIECES
-        beside = np.flatnonzero(np.isin(taken, (THIN, PIECES)))
+            pixel_class[pixel_class == ORGAN] = PIECES
+        beside = np.flatnonzero(np.isin(pixel_class, (THIN, PIECES)))
         points_mm = image_of_frame(self.content, None).points(beside)
-        taken.ravel()[beside[lies_on(motion, points_mm, within_mm)]] = ORGAN
-        return found.with_pixels(taken)
+        pixel_class.ravel()[beside[lies_on(motion, points_mm, within_mm)]] = ORGAN
+        return found.with_pixels(pixel_class)
 
     def _cropped(
         self, cloud: SensorCloud, range_mm: tuple[float, float] | None
@@ -114,7 +116,7 @@ class View:
         count, hint = len(cloud.points_mm), "--range" if range_mm else ""
         if self.path == NO_CLOUD:
             words = "no cloud: the organ was touched alone."
-            return cloud, {"file": "", "hint": "touches", "organ": 0, "of": 0, "words": words}
+            return cloud, {"file": "", "hint": "touches", "organ": 0, "of": 0, "message": words}
         if range_mm:
             cloud = crop_cloud(cloud, *range_mm)
         kept = len(cloud.points_mm)
@@ -131,11 +133,11 @@ class OrganInView(NamedTuple):
 
     cloud: SensorCloud
     entry: dict[str, Any]
-    taken: UInt8[np.ndarray, "h w"] | None = None
+    pixel_class: UInt8[np.ndarray, "h w"] | None = None
     around: tuple[str, str] = ("", "")
 
-    def with_pixels(self, taken: UInt8[np.ndarray, "h w"]) -> OrganInView:
-        numbers = np.bincount(taken.ravel(), minlength=len(STEPS)).tolist()
+    def with_pixels(self, pixel_class: UInt8[np.ndarray, "h w"]) -> OrganInView:
+        numbers = np.bincount(pixel_class.ravel(), minlength=len(STEPS)).tolist()
         counts = {name: n for name, n in zip(STEPS, numbers, strict=True) if n}
         returns = sum(n for name, n in counts.items() if name != "no return")
         others = ", ".join(f"{name} {n}" for name, n in counts.items()
@@ -144,18 +146,18 @@ class OrganInView(NamedTuple):
         words = f"{organ} of {returns} pixels with a return were taken for the organ, by "
         words += f"{self.entry['hint']}{f' (others: {others})' if others else ''}"
         entry = {"organ": organ, "of": returns, "pixels": counts}
-        entry["words"] = f"{self.around[0]}{words}{self.around[1]}."
-        return self._replace(taken=taken, entry={**self.entry, **entry})
+        entry["message"] = f"{self.around[0]}{words}{self.around[1]}."
+        return self._replace(pixel_class=pixel_class, entry={**self.entry, **entry})
 
 
 def _with_noise(content: DepthFrame | SensorCloud, words: str) -> dict[str, Any]:
     """The words, and the noise that was measured, as entries."""
     if (noise := noise_of(content)) is None:
-        return {"words": words}
-    return {"noise": noise.entry, "words": f"{words.removesuffix('.')}; {noise.words}."}
+        return {"message": words}
+    return {"noise": noise.entry, "message": f"{words.removesuffix('.')}; {noise.message}."}
 
 
-def read_views(paths: Sequence[Path], options: LocateOptions) -> list[View]:
+def read_views(paths: Sequence[Path], options: LocateOptions) -> list[ViewFile]:
     """Read clouds, or depth images with their intrinsics. Raises InputError: one cannot be read, or
     an option is for the other kind."""
     cameras: tuple[Path | None, ...] = options.intrinsics or (None,)
@@ -173,11 +175,11 @@ def read_views(paths: Sequence[Path], options: LocateOptions) -> list[View]:
     return [replace(view, content=with_depth_error(view.content, stated)) for view in views]
 
 
-def _read_view(path: Path, intrinsics: Path | None, options: LocateOptions) -> View:
+def _read_view(path: Path, intrinsics: Path | None, options: LocateOptions) -> ViewFile:
     if path == NO_CLOUD:
         if options.evidence is None:
             raise InputError("without a cloud (-) give --evidence FILE with touches or outlines.")
-        return View(path, SensorCloud(np.zeros((0, 3), np.float32)))
+        return ViewFile(path, SensorCloud(np.zeros((0, 3), np.float32)))
     suffix = path.suffix.lower()
     if suffix in DEPTH_SUFFIXES and (suffix not in CLOUD_SUFFIXES or intrinsics is not None):
         if intrinsics is None:
@@ -189,13 +191,13 @@ def _read_view(path: Path, intrinsics: Path | None, options: LocateOptions) -> V
         if options.depth_unit is None:
             in_file = "depth_unit_mm" in read_json(intrinsics)
             stated_by = f"stated in {intrinsics.name}" if in_file else "the default"
-        return View(path, frame, unit=(unit_mm, stated_by))
+        return ViewFile(path, frame, unit=(unit_mm, stated_by))
     if suffix in CLOUD_SUFFIXES and (intrinsics is not None or options.depth_unit is not None):
         option = "--intrinsics" if intrinsics is not None else "--depth-unit"
         raise InputError(f"{option} is for depth images; {path} is a cloud.")
     cloud, notes = read_cloud(path, options.unit)
     check_cloud(cloud)  # before the crop, which would only say that nothing lies in range
-    return View(path, cloud, notes)
+    return ViewFile(path, cloud, notes)
 
 
 def read_places(poses: Path | None, views: int) -> tuple[str, tuple[Affine, ...]]:
@@ -207,12 +209,12 @@ def read_places(poses: Path | None, views: int) -> tuple[str, tuple[Affine, ...]
     return read_poses(poses, views)
 
 
-def further_looks(
-    organs: Sequence[SensorCloud], views: Sequence[View], fixed_from_camera: Sequence[Affine]
-) -> list[Look]:
+def further_views(
+    organs: Sequence[SensorCloud], views: Sequence[ViewFile], fixed_from_camera: Sequence[Affine]
+) -> list[View]:
     """All views but the first, in whose frame the estimate is."""
     return [
-        Look(organ, view.content, np.linalg.inv(fixed_from_camera[0]) @ pose)
+        View(organ, view.content, np.linalg.inv(fixed_from_camera[0]) @ pose)
         for organ, view, pose in list(zip(organs, views, fixed_from_camera, strict=False))[1:]
     ]
 
@@ -235,14 +237,18 @@ def _picked_mm(frame: DepthFrame, column: int, row: int) -> Float[np.ndarray, " 
 
 
 def as_fitted(
-    views: Sequence[View], found: Sequence[OrganInView], estimate: Estimate, model: Model
+    views: Sequence[ViewFile], found: Sequence[OrganInView], estimate: Estimate, model: Model
 ) -> list[OrganInView]:
     """The organ in each view, by an estimate in the frame of the first."""
-    motion, looks = estimate.motion, estimate.report.looks
+    motion, corrected = estimate.motion, estimate.report.views
     if not isinstance(motion, ElasticMotion) or not isinstance(model, RegistrationModel):
         return list(found)
     refine = model.config.refine
-    ways = [np.eye(4)] if looks is None else [np.array(pose) for pose in looks.camera_from_look]
+    ways = (
+        [np.eye(4)]
+        if corrected is None
+        else [np.array(pose) for pose in corrected.camera_from_view]
+    )
     out: list[OrganInView] = []
     for view, organ, way in zip(views, found, ways, strict=True):
         width_mm = kernel_width_mm(refine, organ.cloud.noise or PointNoise())

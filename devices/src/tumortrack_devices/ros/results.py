@@ -27,8 +27,8 @@ from tumortrack.live.values import (
     TrackingResult,
     TransformedEstimate,
 )
-from tumortrack_devices.beside import Beside
 from tumortrack_devices.display import MOST_SEEN, seen_points, thinned, wxyz_of
+from tumortrack_devices.extra_status import ExtraStatus
 from tumortrack_devices.network import Rate
 from tumortrack_devices.ros.messages import MM_PER_M, Messages, Outgoing, PointBlock, xyz
 from tumortrack_devices.ros.sensors import CLOUD, cloud_message, plain_cloud
@@ -89,16 +89,16 @@ class ResultMessages:
         self._status_rate, self._levels = Rate(_STATUS_HZ), list[int]()
         self._times_s = deque[float](maxlen=_RATE_OVER)  # of the latest results
         self._meshes_rate, self._markers_rate, self._points_rate = Rate(hz), Rate(hz), Rate(hz)
-        self._beside = Beside()
+        self._extra_status = ExtraStatus()
         self._spots_shown, self._shown = set[tuple[str, int]](), set[str]()
         self._shown_state: tuple[object, ...] | None = None
         self._planned: tuple[Mesh, ...] | None = None  # sent last
 
-    def of(self, result: TrackingResult) -> list[Outgoing]:
+    def messages(self, result: TrackingResult) -> list[Outgoing]:
         """The messages of one result; docs/ros.md describes each topic. Raises InputError for a
         stamp beyond ROS's range."""
         header = self._messages.header(result.stamp_ns, result.published_frame.frame_id)
-        self._beside.update(result)
+        self._extra_status.update(result)
         out: list[Outgoing] = []
 
         def send(suffix: str, kind: str, **values: Any) -> None:
@@ -173,14 +173,14 @@ class ResultMessages:
 
     def _spots(self) -> list[dict[str, Any]]:
         """Where to touch next, with texts, and evidence; of what there was, its deletion."""
-        beside, markers = self._beside, list[dict[str, Any]]()
-        next_mm = np.reshape([touch.place_mm for touch in beside.touches], (-1, 3))
-        every = next_mm, beside.known_mm, beside.contradicting_mm
+        extra_status, markers = self._extra_status, list[dict[str, Any]]()
+        next_mm = np.reshape([touch.place_mm for touch in extra_status.touches], (-1, 3))
+        every = next_mm, extra_status.known_mm, extra_status.contradicting_mm
         for (ns, (colour, radius_m)), places_mm in zip(_SPOTS.items(), every, strict=True):
             if len(places_mm):
                 scale, points = xyz((2 * radius_m,) * 3), PointBlock(places_mm / MM_PER_M)
                 markers.append(_marker(ns, _SPHERES, colour, scale=scale, points=points))
-        for number, touch in enumerate(beside.touches):
+        for number, touch in enumerate(extra_status.touches):
             about = {"id": number, "text": touch.label, "scale": {"z": _TEXT_HEIGHT_M}}
             markers.append(_marker(_NEXT_TEXT, _TEXT, colours.WHITE, touch.place_mm, **about))
         now = {(marker["ns"], marker.get("id", 0)) for marker in markers}
@@ -245,8 +245,8 @@ class ResultMessages:
         if result.latency_ms is not None:
             values["latency_ms"] = f"{result.latency_ms:.3f}"
         values |= {f"{stage}_ms": f"{1000 * s:.3f}" for stage, s in result.seconds.items()}
-        for rank, touch in enumerate(self._beside.touches, start=1):
-            values[f"{_NEXT}_{rank}"] = touch.words
+        for rank, touch in enumerate(self._extra_status.touches, start=1):
+            values[f"{_NEXT}_{rank}"] = touch.message
         return _status(_LEVELS[result.quality], "estimate", result.describe(), result, values)
 
 

@@ -20,7 +20,7 @@ from tumortrack.core.mesh_query import rough_margin
 from tumortrack.core.types import Mesh
 from tumortrack.io.run_folder import CENTRES, CT, MARGIN
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
-from tumortrack_devices.beside import Beside
+from tumortrack_devices.extra_status import ExtraStatus
 from tumortrack_devices.igtl import message as igtl
 from tumortrack_devices.igtl.link import Link
 from tumortrack_devices.igtl.message import Message
@@ -88,7 +88,7 @@ class OpenIgtLinkSink:
         self.link = Link(config.host, config.port, config.connect)
         self._mesh_rate, self._cloud_rate = Rate(config.mesh_hz), Rate(config.cloud_hz)
         self._margins: set[str] = set()  # all so far
-        self._beside, self._advised = Beside(), False
+        self._extra_status, self._advised = ExtraStatus(), False
         self._next, self._closed = 0, False
 
     @property
@@ -171,8 +171,8 @@ class OpenIgtLinkSink:
             yield "POINT", CENTRES, igtl.pack_points(points_mm, labels, colours), {}
 
     def _touches(self, result: TrackingResult) -> Iterator[_Content]:
-        self._beside.update(result)
-        touches = self._beside.touches
+        self._extra_status.update(result)
+        touches = self._extra_status.touches
         self._advised |= bool(touches)
         if self._advised:
             places_mm = np.reshape([touch.place_mm for touch in touches], (-1, 3))

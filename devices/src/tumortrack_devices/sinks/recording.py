@@ -102,7 +102,7 @@ class RecordingSink:
         """With the full names of their topics."""
         make, frame = self._messages.make, result.published_frame
         report = make(STRING, data=json.dumps(_report(result), allow_nan=False))
-        results = [*self._results.of(result), Outgoing("report", STRING, report)]
+        results = [*self._results.messages(result), Outgoing("report", STRING, report)]
         out = [message._replace(suffix=message.topic("/tumortrack")) for message in results]
         if result.observation is None:
             return out

@@ -58,7 +58,7 @@ class RosSink:
             out.suffix: bus.publisher(
                 out.topic(config.namespace), out.message_type, out.suffix == LATCHED
             )
-            for out in self._results.of(nothing)
+            for out in self._results.messages(nothing)
         }
 
     def publish(self, result: TrackingResult) -> None:
@@ -69,7 +69,7 @@ class RosSink:
             self._acknowledged.set()
         self._publish_cameras(result)
         failed: list[str] = []
-        for suffix, _, message in self._results.of(result):
+        for suffix, _, message in self._results.messages(result):
             try:
                 self._publishers[suffix](self._bus.messages.to_bytes(message))
             except TumortrackError as error:

@@ -150,7 +150,7 @@ class ViewerSink:
         now = time.monotonic()
         with self._page():
             self._result, self._came_s = result, now
-            self._scene.beside.update(result)
+            self._scene.extra_status.update(result)
             changed = self._drawn is None or _kind(self._drawn) != _kind(result)
             if changed or self._state == "stale" or now - self._drawn_s >= 1 / self._config.hz:
                 self._drawn_s = now
@@ -280,7 +280,7 @@ class ViewerSink:
                 yield mesh, colour, 2 if label > 1 else 1
             if (margin := margins.get(name)) is not None:
                 vertices_mm = transform_points(camera_from_published, margin.vertices_mm)
-                yield margin.moved(vertices_mm), colour, 1
+                yield margin.with_vertices(vertices_mm), colour, 1
         for number, mesh in enumerate(result.estimate.structures.values()):
             yield mesh, colours.structure_colour(number), 1
 
@@ -380,7 +380,7 @@ def slice_picture(
     """The CT in a plane before the camera, with the rest as in ``outlined``. None if ``motion`` has
     no inverse."""
     sampled = pixels // _COARSER
-    points_ct = motion.back(plane.points(sampled))
+    points_ct = motion.inverse(plane.points(sampled))
     if points_ct is None:
         return None
     picture = ct.picture(points_ct).reshape(sampled, sampled, 3)

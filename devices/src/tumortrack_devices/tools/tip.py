@@ -17,7 +17,7 @@ from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.evidence import Evidence, Free, Held, Landmark, Touch
+from tumortrack.core.evidence import Evidence, FreeSpace, Grasp, Landmark, Touch
 from tumortrack.core.geometry import Affine, Points, transform_points, unit
 from tumortrack.core.report import Point
 from tumortrack.live.tools import Tool, ToolConfig
@@ -156,7 +156,7 @@ class TipTool(Tool):
         if away_mm > _GRASP_MM:
             self._fault = "it holds nothing of the organ, which is more than 1 cm away"
             return
-        point_ct = motion.back(tip_mm)
+        point_ct = motion.inverse(tip_mm)
         std_mm = None if point_ct is None else motion.std_mm(point_ct)
         if point_ct is not None and std_mm is not None:
             std = min(float(std_mm[0]), _LARGEST_STD_MM)
@@ -178,10 +178,10 @@ class TipTool(Tool):
         self.counts["dropped"] += len(self._waiting) - len(fresh)
         self._waiting, given = fresh, [piece for _, piece in fresh]
         if self._on and self._point and (tip_mm := self._tip(now_ns)) is not None:
-            given.append(Piece(Held, tip_mm[:1], self._point))
+            given.append(Piece(Grasp, tip_mm[:1], self._point))
             self.counts["held"] += 1
         if self.config.shaft_mm and (shaft_mm := self._tip(now_ns)) is not None:
-            given.append(Piece(Free, shaft_mm[1:], {"tip_mm": self.config.tip_mm}))
+            given.append(Piece(FreeSpace, shaft_mm[1:], {"tip_mm": self.config.tip_mm}))
             self.counts["free"] += 1
         return given
 
@@ -193,7 +193,7 @@ class TipTool(Tool):
         places_mm = transform_points(_camera_from_published(view), piece.places_mm)
         farthest_mm = float(np.linalg.norm(places_mm, axis=1).max())
         published = self.context.published_frame
-        cancels = piece.kind is Held and not published.moves
+        cancels = piece.kind is Grasp and not published.moves
         error_mm = 0.0 if cancels else published.error_at(farthest_mm) or 0.0
         single = "place_mm" in piece.kind.__struct_fields__
         places = {"place_mm": places_mm[0]} if single else {"places_mm": places_mm}

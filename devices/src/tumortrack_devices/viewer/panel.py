@@ -147,7 +147,7 @@ class StatusPanel(NamedTuple):
             f"<div class='tumortrack-numbers'>{parts}"
             f"<div class='tumortrack-row'><span>latency <b>{latency}</b></span>"
             f"<span>last frame <b>{self.age_s:.1f} s</b> ago</span></div>"
-            f"<div class='tumortrack-beside'>{escape(result.beside)}</div></div>"
+            f"<div class='tumortrack-beside'>{escape(result.extra_status)}</div></div>"
         )
 
     def _parts(self, report: FitReport) -> str:

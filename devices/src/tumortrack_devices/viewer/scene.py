@@ -21,8 +21,8 @@ from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.live import values as live
 from tumortrack.live.values import TrackingResult, TransformedEstimate
 from tumortrack.report.slices import SlicePlane
-from tumortrack_devices.beside import Beside
 from tumortrack_devices.display import MOST_SEEN, seen_colours, seen_points, thinned, wxyz_of
+from tumortrack_devices.extra_status import ExtraStatus
 from tumortrack_devices.viewer.look import Viewpoint
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ class ViewerScene:
             if margin_mm:
                 self._margins_ct = [exact_margin(part, margin_mm) for part in self._at_rest.tumors]
         self.options = DisplayOptions()
-        self.beside = Beside()  # the sink keeps it up to date
+        self.extra_status = ExtraStatus()  # the sink keeps it up to date
         self.margins: dict[str, Mesh] = {}  # of the shown estimate, published frame
         self._shown: tuple[TrackingResult, TransformedEstimate] | None = None
         self._in_sight = list[bool]()  # of places to touch next: no tumor is in front
@@ -122,7 +122,7 @@ class ViewerScene:
         clear = np.zeros((2, 2, 4), np.uint8)
         self._slice = nodes.add_image("/estimate/slice", clear, 1, 1, format="png", **_FLAT)
         self._control = nodes.add_frame("/workcell", show_axes=False, visible=False)
-        # Look, place and node by name
+        # View, place and node by name
         self._drawn: dict[str, tuple[dict[str, Any], np.ndarray, Any]] = {}
 
     def _cloud(
@@ -185,7 +185,7 @@ class ViewerScene:
             for name, node in nodes.items():
                 _put_mesh(node, surfaces.get(name, _NOTHING))
         tumors = [mesh for name, mesh in estimate.meshes.items() if name != self._name]
-        self._put_beside(self.beside, tumors)
+        self._put_extra_status(self.extra_status, tumors)
         self._shown = result, estimate
         self.apply()
 
@@ -195,7 +195,7 @@ class ViewerScene:
         for group in (self._parts, self._shells, self._structures):
             for node in group.values():
                 _put_mesh(node, _NOTHING)
-        self._put_beside(Beside())
+        self._put_extra_status(ExtraStatus())
         self._points.points, self._points.colors = _NO_POINTS, _NO_POINTS.astype(np.uint8)
         self._shown = None
         self._has_slice = self._slice.visible = False
@@ -317,14 +317,14 @@ class ViewerScene:
         self._points.points = estimate.points_mm[some].astype(np.float32)
         self._points.colors = colours.label_colours(estimate.labels[some])
 
-    def _put_beside(self, beside: Beside, tumors: Sequence[Mesh] = ()) -> None:
+    def _put_extra_status(self, extra_status: ExtraStatus, tumors: Sequence[Mesh] = ()) -> None:
         """What to touch next, and the evidence; their labels are made visible by ``apply``. A label
         is drawn over everything: that of a place behind a tumor is left out."""
-        touches = beside.touches[: len(self._labels)]
+        touches = extra_status.touches[: len(self._labels)]
         places = {
             "next": np.reshape([touch.place_mm for touch in touches], (-1, 3)),
-            "known": beside.known_mm,
-            "contradicting": beside.contradicting_mm,
+            "known": extra_status.known_mm,
+            "contradicting": extra_status.contradicting_mm,
         }
         for name, places_mm in places.items():
             self._spots[name].points = places_mm.astype(np.float32)
@@ -344,7 +344,9 @@ class ViewerScene:
         if self._margins_ct is None or motion is None:
             return {name: rough_margin(mesh, self._margin_mm) for name, mesh in tumors.items()}
         return {
-            name: margin.moved(transform_points(self._pose, motion.carry(margin.vertices_mm)))
+            name: margin.with_vertices(
+                transform_points(self._pose, motion.forward(margin.vertices_mm))
+            )
             for name, margin in zip(self._shells, self._margins_ct, strict=True)
             if name in tumors
         }

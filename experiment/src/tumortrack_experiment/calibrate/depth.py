@@ -21,7 +21,7 @@ _INSET_PX, _LEAST_PIXELS = 4, 500  # within the outermost corners; in an image, 
 _STEEPEST = np.cos(np.radians(50))
 _STILL_PX = 0.3  # of corners, between pictures of one pose
 _LEAST_POSES, _LEAST_SPAN_MM = 6, 60.0  # without so much, scale and offset are one number
-_TRAINED = CalibrationConfig(offset_mm=2.0, scale=0.01)  # clinic's cameras (training/presets.py)
+_TRAINED = CalibrationConfig(offset_mm=2.0, scale=0.01)  # elastic's cameras (training/presets.py)
 _WRONG_SIZE = 0.05  # of depth: no camera's error
 _DOWN, _ACROSS = 8, 12  # fields of the image
 

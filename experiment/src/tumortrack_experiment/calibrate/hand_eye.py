@@ -119,7 +119,7 @@ def solve(
         "method": best,
         "left_out_rms_mm": rms_mm,
         "from_chosen_mm": {
-            name: float(_apart_mm(one.camera, answer.camera, points_mm).max())
+            name: float(_distance_mm(one.camera, answer.camera, points_mm).max())
             for name, (one, _) in tried.items()
         },
         "board_size": float(size),
@@ -296,9 +296,9 @@ def _points(at_mm: float) -> Float64[np.ndarray, "5 3"]:
     return np.column_stack([across, np.full(5, at_mm)])
 
 
-def _apart_mm(one: Affine, other: Affine, points_mm: np.ndarray) -> np.ndarray:
-    apart_mm = transform_points(one, points_mm) - transform_points(other, points_mm)
-    return np.linalg.norm(apart_mm, axis=1)
+def _distance_mm(one: Affine, other: Affine, points_mm: np.ndarray) -> np.ndarray:
+    distance_mm = transform_points(one, points_mm) - transform_points(other, points_mm)
+    return np.linalg.norm(distance_mm, axis=1)
 
 
 def _bounds(answer: _Answer, each: list[_Answer], at_mm: float, focal_std: float) -> dict[str, Any]:

@@ -35,7 +35,7 @@ _LIP_MM, _SLOPE = 0.6, np.sqrt(0.5)  # of a cone beyond the circle of touch; 45 
 _FOOT = 1.4  # radii of a post
 _CLEAR_MM = 7.0  # between a post and the organ, whose sides come out when it is pressed
 _APART_MM = 18.0  # of two beads: of two 11 mm apart a CT showed neither
-_LEAN = 0.9  # of a look from the farthest side, by its height
+_LEAN = 0.9  # of a view from the farthest side, by its height
 _TRIES = 60_000
 _GAP_MM, _LEAST_GAP_MM = 2.0, 1.0  # no two pairs of beads are equally far apart to within it
 _MIRROR_MM = 10.0  # so ill fit the mirrored beads: fifty times their error
@@ -83,8 +83,8 @@ def base_design(anatomy_ct: Anatomy, up_lps: Direction, config: BaseConfig) -> B
     """Lay the organ down, surround it with beads, and make what it lies on. The same case and
     configuration give the same base. Raises InputError: no place for the beads."""
     base_from_ct = laid_down(anatomy_ct.organ, up_lps)
-    anatomy = anatomy_ct.of(
-        p.moved(transform_points(base_from_ct, p.vertices_mm)) for p in anatomy_ct.parts
+    anatomy = anatomy_ct.with_parts(
+        p.with_vertices(transform_points(base_from_ct, p.vertices_mm)) for p in anatomy_ct.parts
     )
     sockets = stands.Sockets.beside(anatomy.organ)
     standing = stands.stands_for(config.states, anatomy, sockets)

@@ -86,7 +86,8 @@ def lay_out(
         pull = -pull
     mold_from_ct = _upright(mesh_ct, pull)
     mesh, *tumors = (
-        m.moved(transform_points(mold_from_ct, m.vertices_mm)) for m in (mesh_ct, *tumors_ct)
+        m.with_vertices(transform_points(mold_from_ct, m.vertices_mm))
+        for m in (mesh_ct, *tumors_ct)
     )
     cells = Cells(mesh, _CELL_MM, wall_mm + FLANGE_MM + 3.0)
     field = parting_surface(cells)
@@ -113,7 +114,7 @@ def _upright(mesh: Mesh, pull: np.ndarray) -> np.ndarray:
     across = np.stack([perpendicular(pull), np.cross(pull, perpendicular(pull))])
     longest = unit(np.linalg.eigh(np.cov(across @ mesh.vertices_mm.T))[1][:, 1] @ across)
     turn = np.stack([longest, np.cross(pull, longest), pull])
-    turned = mesh.moved(mesh.vertices_mm @ turn.T)
+    turned = mesh.with_vertices(mesh.vertices_mm @ turn.T)
     return rigid(turn, -turned.box_mm.mean(0))
 
 

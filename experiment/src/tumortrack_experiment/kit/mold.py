@@ -73,9 +73,11 @@ def organ_mold(anatomy: Anatomy, config: MoldConfig) -> OrganMold:
     """
     layout = lay_out(anatomy.organ, anatomy.tumors, config.wall_mm, config.sprue_mm)
     way = layout.mold_from_ct
-    tumors = [t.moved(transform_points(way, t.vertices_mm)) for t in anatomy.tumors]
+    tumors = [t.with_vertices(transform_points(way, t.vertices_mm)) for t in anatomy.tumors]
     pins = place_pins(layout, tumors, config.pin_mm)
-    return _mold(layout, config, "organ", tuple(pin.moved(np.linalg.inv(way)) for pin in pins))
+    return _mold(
+        layout, config, "organ", tuple(pin.transformed(np.linalg.inv(way)) for pin in pins)
+    )
 
 
 def tumor_molds(
@@ -90,14 +92,14 @@ def tumor_molds(
         ways = np.array([pin.way for pin in own])
         layout = lay_out(tumor, (), config.wall_mm, config.sprue_mm, ways)
         there, back = layout.mold_from_ct, np.linalg.inv(layout.mold_from_ct)
-        own = tuple(in_own_mold(pin.moved(there), layout).moved(back) for pin in own)
+        own = tuple(in_own_mold(pin.transformed(there), layout).transformed(back) for pin in own)
         molds.append(_mold(layout, config, f"tumor_{number}", own))
     return tuple(molds)
 
 
 def _mold(layout: Layout, config: MoldConfig, name: str, pins: tuple[Pin, ...]) -> OrganMold:
     """Cut the halves, measure them, and turn them back to the ``ct`` frame."""
-    moved = [pin.moved(layout.mold_from_ct) for pin in pins]
+    moved = [pin.transformed(layout.mold_from_ct) for pin in pins]
     ways = [(pin.tip_mm, pin.mouth_mm + HANDLE_MM * pin.way) for pin in moved]
     halves = cut_halves(layout, config.vent_mm, config.pin_mm, config.clearance_mm, ways)
     organ, up = solid_of(layout.mesh, name), np.array([0.0, 0.0, 1.0])
@@ -149,7 +151,7 @@ def _printed(
         ("least_wall_mm", wall_mm), ("thin_percent", 100 * thin), ("yields_mm", depth_mm),
     )  # fmt: skip
     on_bed = to_bed(mesh.vertices_mm, np.diag([1.0, -up, -up])) @ layout.mold_from_ct
-    own = mesh.moved(transform_points(np.linalg.inv(layout.mold_from_ct), mesh.vertices_mm))
+    own = mesh.with_vertices(transform_points(np.linalg.inv(layout.mold_from_ct), mesh.vertices_mm))
     purpose = f"{name.replace('_', ' ')} half of the mold"
     pieces = split_to_bed(
         PrintedPart(name, purpose, own, "ct", on_bed), config.bed_mm, config.clearance_mm

@@ -53,7 +53,7 @@ class Pin:
         """From the tumor outwards, a unit vector."""
         return unit(self.mouth_mm - self.tip_mm)
 
-    def moved(self, b_from_a: Float64[np.ndarray, "4 4"]) -> Pin:
+    def transformed(self, b_from_a: Float64[np.ndarray, "4 4"]) -> Pin:
         """The same in another frame."""
         ends = transform_points(b_from_a, np.stack([self.tip_mm, self.entry_mm, self.mouth_mm]))
         return Pin(self.tumor, self.diameter_mm, *ends)

@@ -20,7 +20,7 @@ _MOST_PIECES, _MOST_PEGS = 64, 4
 
 def laid_mesh(part: PrintedPart) -> Mesh:
     """As it lies on the printer's bed."""
-    return part.mesh.moved(transform_points(part.print_from_frame, part.mesh.vertices_mm))
+    return part.mesh.with_vertices(transform_points(part.print_from_frame, part.mesh.vertices_mm))
 
 
 def fits(part: PrintedPart, bed_mm: tuple[float, float, float]) -> bool:
@@ -65,7 +65,7 @@ def split_to_bed(
     out, back = [], np.linalg.inv(part.print_from_frame)
     for n, mesh in enumerate(map(mesh_of, pieces), 1):
         on_bed = to_bed(mesh.vertices_mm, np.eye(3)) @ part.print_from_frame
-        own = mesh.moved(transform_points(back, mesh.vertices_mm))
+        own = mesh.with_vertices(transform_points(back, mesh.vertices_mm))
         name, purpose = f"{part.name}_{n}", f"{part.purpose}, piece {n} of {len(pieces)}"
         out.append(replace(part, name=name, purpose=purpose, mesh=own, print_from_frame=on_bed))
     return tuple(out)

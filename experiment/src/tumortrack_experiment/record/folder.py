@@ -18,7 +18,7 @@ from typing import Any
 
 import tumortrack
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import HERE, Affine
+from tumortrack.core.geometry import IDENTITY, Affine
 from tumortrack.core.store import read_json, write_json, writing
 from tumortrack.live.values import Observation
 from tumortrack_devices.recording.mcap import STRING, McapBag, camera_messages
@@ -89,7 +89,7 @@ class RecordingFolder:
 
     def add(self, seen: Observation, fixed_from_camera: Affine | None) -> None:
         """What was seen next. Raises StorageError: the disk refuses."""
-        where = HERE if fixed_from_camera is None else fixed_from_camera
+        where = IDENTITY if fixed_from_camera is None else fixed_from_camera
         out = camera_messages(seen, where, self.about["frame_id"], self._messages)
         if fixed_from_camera is None:
             out = [one for one in out if one.suffix != TF]

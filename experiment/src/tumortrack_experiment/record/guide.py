@@ -129,7 +129,7 @@ class Guide:
             say("  note: no picture comes with the depth images (realsense?picture=true)")
         table = self._check.watch and self._check.watch.table_in_camera
         if not table and not self._known and not self.setup.poses:
-            say("  note: no table was found in this, so nobody notices if the camera moves")
+            say("  note: no table was found in this, so camera motion cannot be detected")
         answer = "" if self.options.yes else self._ask()
         if answer not in (_AGAIN, _QUIT):
             self._known = self._known or table

@@ -24,8 +24,8 @@ from tumortrack_experiment.reference.deformed import parts_in, segment_deformed
 from tumortrack_experiment.register.beads import CT, NamedBeads, name_beads, register
 from tumortrack_experiment.register.build import say_registration
 from tumortrack_experiment.register.frames import (
-    apart_mm,
     beads_in_view,
+    distance_mm,
     moments_of,
     one_of,
     states_in,
@@ -55,8 +55,8 @@ def write_reference(given: Reference) -> None:
     windows, others = (given.organ_hu, given.tumor_hu), (parts, [*balls, *inner])
     in_ct2, report = segment_deformed(volume, in_ct.device_from_base, kit, case, others, windows)
     say_notes(report["notes"])
-    moved = (p.moved(transform_points(one.to_from, p.vertices_mm)) for p in in_ct2.parts)
-    anatomy = in_ct2.of(moved)
+    moved = (p.with_vertices(transform_points(one.to_from, p.vertices_mm)) for p in in_ct2.parts)
+    anatomy = in_ct2.with_parts(moved)
     beads = in_view.points_mm[in_view.found], kit.bead_diameter_mm
     known = scenes.kit_pixels(frame, in_view.device_from_base, [*parts.values()], beads)
     cloud = scenes.organ_cloud(frame, known)
@@ -110,7 +110,7 @@ def _moved(
         except InputError as error:
             say_notes([f"{other}: where the base was is unknown: {error}"])
             continue
-        moved[other] = apart_mm(kit, place(*here), place(there, beads))
+        moved[other] = distance_mm(kit, place(*here), place(there, beads))
         if moved[other] > _MOVED_MM:
             raise InputError(
                 f"camera or base moved by {moved[other]:.1f} mm between {state} and {other} (at "

@@ -40,7 +40,9 @@ def parts_in(kit: Kit, folder: Path, state: str) -> dict[str, Mesh]:
         if part.base_from_part is not None and part.state in ("", state):
             mesh = read_mesh(folder / part.file)
             base_from_part = np.array(part.base_from_part)
-            found[part.name] = mesh.moved(transform_points(base_from_part, mesh.vertices_mm))
+            found[part.name] = mesh.with_vertices(
+                transform_points(base_from_part, mesh.vertices_mm)
+            )
     return found
 
 
@@ -83,7 +85,7 @@ def segment_deformed(
         "tumor_shift_mm": np.linalg.norm(middles[order] - places, axis=1).tolist(),
         "notes": notes,
     }
-    return case.anatomy.of((anatomy.organ, *tumors)), report
+    return case.anatomy.with_parts((anatomy.organ, *tumors)), report
 
 
 def _cropped(volume: Volume, ct_from_base: np.ndarray, kit: Kit, rest_mm: np.ndarray) -> Volume:
@@ -117,7 +119,7 @@ def _without_base(
     x, y, z, shift = base_from_index[2]
     hu[x * i + y * j + z * k + shift < 0] = AIR_HU
     for name, part in parts.items():
-        there = part.moved(transform_points(ct_from_base, part.vertices_mm))
+        there = part.with_vertices(transform_points(ct_from_base, part.vertices_mm))
         inside = voxelise(there, affine, hu.shape)
         if inside.any() and np.median(volume.hu[inside]) < _LEAST_PRINT_HU:
             raise InputError(

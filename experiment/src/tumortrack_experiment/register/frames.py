@@ -127,7 +127,7 @@ def still_beads(kit: Kit, moments: list[Moment], state: str) -> tuple[DepthFrame
     if len(frames) >= _HALVES:
         halves = frames[: len(frames) // 2], frames[len(frames) // 2 :]
         poses = [beads_in_view(kit, median_of(half)).device_from_base for half in halves]
-        if (moved_mm := apart_mm(kit, *poses)) > _STILL_MM:
+        if (moved_mm := distance_mm(kit, *poses)) > _STILL_MM:
             raise InputError(
                 f"{state}: the camera or the base moved by {moved_mm:.1f} mm while it was recorded "
                 f"(at most {_STILL_MM:g} mm is noise). Record it again."
@@ -136,7 +136,7 @@ def still_beads(kit: Kit, moments: list[Moment], state: str) -> tuple[DepthFrame
     return median, beads_in_view(kit, median)
 
 
-def apart_mm(kit: Kit, first_from_base: np.ndarray, second_from_base: np.ndarray) -> float:
+def distance_mm(kit: Kit, first_from_base: np.ndarray, second_from_base: np.ndarray) -> float:
     """How far apart two poses of the base put a bead, rms."""
     places = [transform_points(pose, kit.beads_mm) for pose in (first_from_base, second_from_base)]
     return float(np.sqrt(((places[0] - places[1]) ** 2).sum(1).mean()))

@@ -126,7 +126,7 @@ def provenance(
         "case_sha256": run.case_sha256,
         "up_lps": list(run.up_lps),
         "patient": to_builtins(run.patient),
-        "organ": organ_entry(run.anatomy_ct.kind),
+        "organ": organ_entry(run.anatomy_ct.organ_kind),
     }
 
 

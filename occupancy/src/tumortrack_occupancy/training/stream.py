@@ -21,7 +21,7 @@ def labelled_scene(
     """The scene, its points (camera frame, mm) and their labels."""
     scene, rng = simulator.draw(recipe)
     points_ct, labels = pool.draw(rng)
-    return scene, scene.carry(points_ct).astype(np.float32, copy=False), labels
+    return scene, scene.forward(points_ct).astype(np.float32, copy=False), labels
 
 
 class Batch(NamedTuple):

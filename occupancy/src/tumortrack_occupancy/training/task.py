@@ -89,10 +89,10 @@ class OccupancyTask:
             scene = simulator.render(recipe)
             points_ct, labels = pool.draw_evenly(recipe.generator(999), config.validation_points)
             observed = scene.cloud.points_mm
-            organ = scene.carry(run.anatomy_ct.organ.vertices_mm) - np.median(observed, axis=0)
+            organ = scene.forward(run.anatomy_ct.organ.vertices_mm) - np.median(observed, axis=0)
             box = np.array([organ.min(0), organ.max(0)], float)
             cloud = refill(observed, config.scene.cloud.n_points)
-            rows.append((cloud, scene.carry(points_ct), labels, box))
+            rows.append((cloud, scene.forward(points_ct), labels, box))
         return ValidationScenes(*(np.stack(column) for column in zip(*rows, strict=True)))
 
     def _logits(

@@ -114,7 +114,7 @@ def _say_end(resection: ResectionSession) -> None:
     if state != "done":
         if halt is not None and halt.kind == "interrupted":
             raise KeyboardInterrupt
-        raise Aborted(f"the resection was {state}: {halt.words if halt else ''}.")
+        raise Aborted(f"the resection was {state}: {halt.message if halt else ''}.")
     if resection.moving:
         say("done: all motions were sent; see where the arms stand.")
     else:

@@ -1,4 +1,4 @@
-// What tumortrack_lab runs in its inner loops: the bed round an organ, and an electrode's kerf.
+// What tumortrack_benchmarks runs in its inner loops: the bed round an organ, and an electrode's kerf.
 #include "native.h"
 
 struct bed_spline { f64_3 values; f64_2 places; f64_1 out; f64_2 slope; };

@@ -1,4 +1,4 @@
-// See ``registration.bend``.
+// See ``registration.compliance``.
 #include "fast/gauss_newton.h"
 
 // -2 log of the evidence of the prior that ``explained`` (n, n; J C J', mm^2) follows from, for the

@@ -1,13 +1,13 @@
 // See registration/motion.py.
 #include "fast/motion.h"
 
-struct carry {
+struct forward {
     Flow flow;
     Pose pose;
     f32_2 points;
     f64_2 out;
 };
-KERNEL(void, carry) {
+KERNEL(void, forward) {
     const double *center = a->pose.center_ct.at, *turn = a->pose.rotation.at;
     Block block;
     for (int64_t first = 0, count; (count = next_block(&a->flow, &a->points, first, &block));
@@ -25,13 +25,13 @@ KERNEL(void, carry) {
     }
 }
 
-struct back {
+struct inverse {
     Flow flow;
     Pose pose;
     f32_2 points;
     f64_2 out;
 };
-KERNEL(void, back) {
+KERNEL(void, inverse) {
     const double *center = a->pose.center_ct.at, *turn = a->pose.rotation.at;
     const double *to = a->pose.centre_mm.at;
     const float *origin = a->flow.origin_mm.at, per_cell = 1 / (float)a->flow.spacing_mm;

@@ -120,8 +120,8 @@ def phantom_labels(parameters: PhantomParameters, voxel_mm: float = 0.8) -> Labe
 
 def gap_mm(a: TumorParameters, b: TumorParameters) -> float:
     """A lower bound of the distance between two tumors' surfaces."""
-    apart_mm = np.linalg.norm(np.subtract(a.center_mm, b.center_mm))
-    return float(apart_mm - (a.radius_mm + b.radius_mm))
+    distance_mm = np.linalg.norm(np.subtract(a.center_mm, b.center_mm))
+    return float(distance_mm - (a.radius_mm + b.radius_mm))
 
 
 def organ_field(parameters: PhantomParameters, axes_mm: Axes) -> Float[np.ndarray, "i j k"]:
