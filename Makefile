@@ -24,12 +24,12 @@ COMPILER = $(BIN)/python tools/build_backend.py --compiler >/dev/null 2>&1 || { 
 NO_COMPILER = $(BIN)/pip uninstall --quiet --yes ziglang 2>/dev/null
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian clients demo demo-scenes test quick pythons pytest test-hard check attack replay fingerprint figures bench soak wheel lock licences audit world pull bounds evidence noise rehearsal population site pictures clean
+.PHONY: help setup debian clients demo demo-scenes test quick pythons pytest test-hard check attack replay fingerprint figures bench soak wheel lock licences audit stress pull bounds evidence noise rehearsal population site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
 
-setup: $(SETUP)  ## install everything into .venv: tracker, devices, the paper's method with PyTorch, resection, laboratory, experiment, what tests and the site need
+setup: $(SETUP)  ## install everything into .venv: tracker, devices, the paper's method with PyTorch, resection, benchmarks, experiment, what tests and the site need
 
 $(TRACKER): pyproject.toml requirements/core.txt requirements/uv.txt requirements/compiler.txt
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 15) and "tumortrack needs Python 3.11 to 3.14, and this is " + sys.version.split()[0] + "; give make PYTHON=python3.12, or another of these")'
@@ -160,10 +160,10 @@ pictures: demo debian  ## the pictures in docs/images that the demo shows (docs/
 	$(BIN)/tumortrack resect runs/pictures/plan --film docs/images/resection.gif
 	TUMORTRACK_PICTURES=docs/images TUMORTRACK_DEMO=runs/demo TUMORTRACK_PLAN=runs/pictures/plan $(BIN)/pytest -n0 devices/tests/test_viewer_page.py
 
-wheel: setup $(TOOLS)  ## build the wheels of tracker, devices, the paper's method, resection, experiment and laboratory into dist/, with their dependencies (SBOM)
+wheel: setup $(TOOLS)  ## build the wheels of tracker, devices, the paper's method, resection, experiment and benchmarks into dist/, with their dependencies (SBOM)
 	rm -rf dist build/lib devices/build occupancy/build resection/build benchmarks/build experiment/build  # modules that are gone would be packed from there
 	CC=".tools/bin/python -m ziglang cc" $(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist --config-settings portable=1 .
-	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist ./devices ./occupancy ./resection ./experiment ./lab
+	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist ./devices ./occupancy ./resection ./experiment ./benchmarks
 	rm -f $(NATIVE)/*.elf && $(MAKE) --no-print-directory $(KERNELS)  # for this machine again
 	.tools/bin/twine check --strict dist/*.whl
 	.tools/bin/auditwheel show dist/tumortrack-*.whl

@@ -139,7 +139,7 @@ def of_evidence(kind: str, number: int) -> Numbers:
 
 
 def drawn(scene: Scene, kind: str, rng: np.random.Generator) -> Sequence[Any]:
-    """Evidence that is true to about 1 mm. Not as the laboratory draws it: what changes there would
+    """Evidence that is true to about 1 mm. Not as the benchmarks draw it: what changes there would
     be another question here."""
     organ, targets = scene.reference.organ, scene.targets
     assert targets is not None

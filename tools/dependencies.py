@@ -128,7 +128,7 @@ def _resolved(wanted: str, kept: str, upgrade: list[str]) -> str:
 
 _ABOUT = {
     "core": "The tracker alone, by hash: what `make demo` installs.",
-    "rest": "All else that `make setup` installs: PyTorch, extras, laboratory, tests, site.",
+    "rest": "All else that `make setup` installs: PyTorch, extras, benchmarks, tests, site.",
     "cuda": "What PyPI's PyTorch for Linux needs besides; its CPU build does not.",
     "clients": "What `make clients` installs besides: other makers' programs that tests talk to.",
     "ur": "For real arms: pip install --require-hashes --no-deps -r requirements/ur.txt",

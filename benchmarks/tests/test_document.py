@@ -154,6 +154,6 @@ def test_a_table_goes_beside_the_document(tmp_path):
 def test_scripts_are_imported_and_say_what_they_do(name, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", [f"{name}.py", "--help"])
     with pytest.raises(SystemExit) as stopped:
-        runpy.run_path(str(ROOT / "lab" / "scripts" / f"{name}.py"), run_name="__main__")
+        runpy.run_path(str(ROOT / "benchmarks" / "scripts" / f"{name}.py"), run_name="__main__")
     assert stopped.value.code == 0
     assert "usage:" in capsys.readouterr().out

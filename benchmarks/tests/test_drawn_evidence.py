@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from evidence import errors, foresight
 
-import world_objects
+import stress_objects
 from tumortrack.core.errors import ArtifactError
 from tumortrack.core.geometry import triangles_of
 from tumortrack.core.mesh_query import contains
@@ -35,7 +35,7 @@ EXACT = EvidenceErrors(
 
 @cache
 def scene() -> Scene:
-    return world_objects.world(hidden=0.0, segmentation=0.0).scene(0)
+    return stress_objects.world(hidden=0.0, segmentation=0.0).scene(0)
 
 
 def source(errors=EXACT, *seed) -> EvidenceSource:

@@ -15,7 +15,7 @@ from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.io.case import load_case
 from tumortrack.io.scene_folder import Scene
 from tumortrack_benchmarks.physics.organ import transformed
-from world_objects import ANATOMY
+from stress_objects import ANATOMY
 
 FLAT = DepthFrame(np.full((480, 848), 300.0, np.float32), d405())
 

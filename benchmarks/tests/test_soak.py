@@ -16,7 +16,7 @@ pytestmark = pytest.mark.slow
 
 def test_every_fault_is_named_and_nothing_wrong_is_called_good(phantom_case, elastic_model):
     """The hour is `make soak`. On a loaded machine frames may be older, and answers take longer."""
-    soak = Path(__file__).parents[2] / "lab" / "scripts" / "soak.py"
+    soak = Path(__file__).parents[2] / "benchmarks" / "scripts" / "soak.py"
     options = shlex.split("--minutes 1.95 --seed 2 --fps 5 --stale-s 1 --within-s 20 --wrong-mm 12")
     done = subprocess.run(
         [sys.executable, str(soak), str(elastic_model), str(phantom_case), *options],

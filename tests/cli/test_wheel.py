@@ -1,4 +1,4 @@
-"""The wheel, installed as a user does: its command line and its API, without the laboratory."""
+"""The wheel, installed as a user does: its command line and its API, without the benchmarks."""
 
 import os
 import re
@@ -63,7 +63,7 @@ def test_commands_and_an_example_run_from_the_wheel(environment, tmp_path):
     assert "BROKEN" not in said
     listed = run(*command, "--help", env=clean)
     assert "locate" in listed
-    assert "twin" not in listed  # the laboratory's
+    assert "twin" not in listed  # the benchmarks'
     for name, package in (
         ("onnx", "tumortrack-occupancy"),
         ("plan", "tumortrack-resection"),

@@ -1,4 +1,4 @@
-"""The laboratory's commands, which `tumortrack` finds through entry points."""
+"""The benchmarks' commands, which `tumortrack` finds through entry points."""
 
 from tumortrack_benchmarks.cli.bench import Bench
 from tumortrack_benchmarks.cli.fleet import Fleet

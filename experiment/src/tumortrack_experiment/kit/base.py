@@ -124,7 +124,7 @@ def base_design(anatomy_ct: Anatomy, up_lps: Direction, config: BaseConfig) -> B
 
 def laid_down(organ_ct: Mesh, up_lps: Direction) -> Float64[np.ndarray, "4 4"]:
     """``base_from_ct``: z up, the long axis along x, the box's middle at x = y = 0, its foot at 0,
-    as the laboratory's twin lays it down."""
+    as the benchmarks' twin lays it down."""
     upright = rotation_onto(np.array(up_lps), np.array([0.0, 0.0, 1.0]))
     flat = (organ_ct.vertices_mm - organ_ct.vertices_mm.mean(0)) @ upright.T
     x, y = np.linalg.eigh(np.cov(flat[:, :2].T))[1][:, 1]

@@ -24,7 +24,7 @@ from tumortrack_experiment.kit.solids import ball, box, cone, written
 from tumortrack_experiment.kit.values import PrintedPart
 
 COMPRESSION_MM = {"D1": 4.0, "D2": 8.0, "D3": 12.0}
-POKE_MM, POKE_DIAMETER_MM = 10.0, 8.0  # as the laboratory's twin has them
+POKE_MM, POKE_DIAMETER_MM = 10.0, 8.0  # as the benchmarks' twin has them
 PLATE_MM = 36.0  # along the organ
 _TILTS_DEG = (2, 25)  # what lies farther over slides
 _GAP_MM = 10.0  # between organ and legs: at D3 a kidney's sides come out by some 5 mm
