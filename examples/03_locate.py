@@ -24,7 +24,7 @@ def main(out: Path, steps: int) -> None:
             # Begun before? Then this goes on where it stopped, and ends with the same weights.
             steps=steps,
             workers=1,  # processes that make scenes, beside the one that learns
-            report=lambda status: print(f"step {status.step}: loss {status.loss:.3f}"),
+            on_status=lambda status: print(f"step {status.step}: loss {status.loss:.3f}"),
         )
         tell(tt.Tracker(network).locate(scene.cloud, grid=48))
 

@@ -9,13 +9,13 @@ import pytest
 from noise import Condition, disturbed, placed
 
 from stories import looking_down
+from stress_objects import ANATOMY
 from tumortrack.core.camera import d405, deproject
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.io.case import load_case
 from tumortrack.io.scene_folder import Scene
 from tumortrack_benchmarks.physics.organ import transformed
-from stress_objects import ANATOMY
 
 FLAT = DepthFrame(np.full((480, 848), 300.0, np.float32), d405())
 

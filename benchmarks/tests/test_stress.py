@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from refused import refused
+from stress_objects import ellipsoid, organ, world
 from tumortrack.core import store
 from tumortrack.core.camera import d405
 from tumortrack.core.geometry import transform_points
@@ -28,7 +29,6 @@ from tumortrack_benchmarks.physics.noise import StereoCamera, StereoConfig
 from tumortrack_benchmarks.physics.organ import Slit, Stage, cut_open
 from tumortrack_benchmarks.physics.solid import NeoHookeanSolid
 from tumortrack_benchmarks.physics.tets import TetMesh, tetrahedralise
-from stress_objects import ellipsoid, organ, world
 
 CAMERA = d405(424, 240)
 SILENT = {"bias_px": 0.0, "lens_px": 0.0, "slant_px": 0.0, "gloss_degrees": 0.0, "quantum_mm": 0.0}

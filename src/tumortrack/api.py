@@ -245,7 +245,7 @@ def train(
     device: Device = "auto",
     workers: int | None = None,
     checkpoint_every_s: float = 30.0,
-    report: Callable[[TrainingStatus], None] | None = None,
+    on_status: Callable[[TrainingStatus], None] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Model:
     """A model of its own folder. The default preset, ``elastic``, has nothing to learn: a case
@@ -265,7 +265,7 @@ def train(
         steps: likewise; give at most one of the two.
         workers: processes that make scenes (default: as the machine allows).
         checkpoint_every_s: a crash loses at most the steps since.
-        report: of a training: called every few seconds.
+        on_status: of a training: called every few seconds.
         progress: of making a model that learns nothing: steps done, of how many.
     """
     from tumortrack.core.renamed import hint
@@ -302,7 +302,7 @@ def train(
         seed=seed, steps=steps, minutes=minutes, device=device, workers=workers,
         checkpoint_every_s=checkpoint_every_s,
     )  # fmt: skip
-    return method.train(known, Path(folder), config, options, report or (lambda status: None))
+    return method.train(known, Path(folder), config, options, on_status or (lambda status: None))
 
 
 def load_model(folder: StrPath, device: Device = "auto") -> Model:
@@ -493,7 +493,7 @@ def estimate_from_surfaces(surfaces: Mapping[str, Mesh], grid: int = 160) -> Est
 def evaluate(
     locate: Tracker | StrPath | Callable[[SensorCloud], Estimate],
     scenes: StrPath | Sequence[Scene],
-    report: StrPath | None = None,
+    folder: StrPath | None = None,
     overwrite: bool = False,
     *,
     grid: int = 160,
@@ -509,7 +509,7 @@ def evaluate(
         locate: a tracker, the folder of a case or model, or any function from an observed cloud to
             an estimate; it gets ``evidence=`` of scenes that have some.
         scenes: folder of scene folders, or scenes.
-        report: folder for report.json, index.html and pictures (scenes of a folder only).
+        folder: for report.json, index.html and pictures (scenes of a folder only).
         overwrite: replace an earlier report there.
         grid: voxels along the longest side of a tracker's labelled volume.
         seed: of its random points and queries.
@@ -536,16 +536,16 @@ def evaluate(
             "evaluate(Tracker(load_model(FOLDER)), scenes)."
         )
     if isinstance(scenes, str | Path):
-        if report is None:
+        if folder is None:
             raise InputError("evaluating a folder of scenes writes a report: say where.")
-        folder, out, step = Path(scenes), Path(report), progress or (lambda: None)
+        given, out, step = Path(scenes), Path(folder), progress or (lambda: None)
         protocol.check_place(out, overwrite)
         if isinstance(locate, Path | Tracker):
-            written = protocol.evaluate_model(locate, folder, out, grid, seed, device, step)
+            written = protocol.evaluate_model(locate, given, out, grid, seed, device, step)
             return evaluation(written)
         call: Any = getattr(locate, "locate", locate)
         baselines = baselines_of(getattr(locate, "model", None))
-        return evaluation(protocol.evaluate_scenes(call, folder, out, step, baselines=baselines))
+        return evaluation(protocol.evaluate_scenes(call, given, out, step, baselines=baselines))
     if not scenes:
         raise InputError("there are no scenes to evaluate: simulate_scenes(case, 20) makes some.")
     if isinstance(locate, Path):

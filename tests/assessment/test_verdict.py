@@ -22,8 +22,9 @@ from tumortrack.core.report import EvidenceReport
 from tumortrack.core.types import DepthFrame, Mesh, PointNoise, SensorCloud
 from tumortrack.io.model_folder import reliability_warning
 from tumortrack.registration.motion import ElasticMotion
+from tumortrack.tracking.follower import Follower, FollowerConfig
 from tumortrack.tracking.model_files import load_model
-from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
+from tumortrack.tracking.tracker import Tracker
 from warp_objects import ANATOMY, PLACE_MM, TURNED
 
 CAMERA = d405(424, 240)

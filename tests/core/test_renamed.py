@@ -25,8 +25,10 @@ from tumortrack.core import store
 from tumortrack.core.assessment import Assessment
 from tumortrack.core.config import from_builtins
 from tumortrack.core.errors import InputError
+from tumortrack.core.evidence import Evidence
 from tumortrack.core.renamed import NOTHING, attributes_of, hint, in_report, table
 from tumortrack.core.report import Check, FitReport
+from tumortrack.io.evidence_files import EvidenceFile
 from tumortrack.live.spec import SINKS
 from tumortrack.tracking.presets import PRESETS
 from tumortrack_resection import files
@@ -162,6 +164,13 @@ CONFIGURED = {
     "ResectionConfig": lambda key: from_builtins({key: 1}, ResectionConfig, "FILE"),
     "RecordingSinkConfig": sink("recording"),
     "ViewerSinkConfig": sink("viewer"),
+    "EvidenceFile": lambda kind: from_builtins(
+        {"frame": "camera", "unit": "mm", "evidence": [{"kind": kind}]}, EvidenceFile, "FILE"
+    ),
+}
+KNOWN = {
+    *ResectionConfig.__struct_fields__,
+    *(kind.__struct_config__.tag for kind in typing.get_args(Evidence)),
 }
 
 
@@ -171,7 +180,7 @@ def test_a_key_of_a_configuration(section, old):
     with pytest.raises(InputError) as told:
         CONFIGURED[kind](key)
     assert hint(section, old) in str(told.value)
-    assert {*code(section, old)} <= {*ResectionConfig.__struct_fields__}
+    assert {*code(section, old)} <= KNOWN
 
 
 def inner(kind: object, keys: list[str]) -> object:

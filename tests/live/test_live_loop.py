@@ -15,7 +15,8 @@ from tumortrack.live.loop import Loop, LoopConfig
 from tumortrack.live.values import Controls, PublishedFrame, SinkContext
 from tumortrack.live.workers import SourceWorker
 from tumortrack.segmentation import RegionConfig
-from tumortrack.tracking.tracker import Follower, FollowerConfig, Tracker
+from tumortrack.tracking.follower import Follower, FollowerConfig
+from tumortrack.tracking.tracker import Tracker
 from warp_objects import ANATOMY, slim_elastic
 
 FRAME_NS = 33_000_000

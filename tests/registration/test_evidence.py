@@ -29,7 +29,7 @@ from tumortrack.io.evidence_files import evidence_json, read_evidence
 from tumortrack.io.ply import write_cloud_ply
 from tumortrack.registration.evidence import EvidenceTerms, TrackedEvidence, propagate
 from tumortrack.registration.multi_view import MultiViewCloud
-from tumortrack.tracking.tracker import Follower, FollowerConfig
+from tumortrack.tracking.follower import Follower, FollowerConfig
 from warp_objects import ANATOMY, method, nudged, placed, shape
 
 NAMES = ANATOMY.names

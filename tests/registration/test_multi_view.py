@@ -10,7 +10,7 @@ import pytest
 from msgspec import structs
 from scipy.spatial.transform import Rotation
 
-from elastic_objects import compliant, organ
+from elastic_objects import bent, organ
 from live_objects import small_setting
 from refused import refused
 from stories import answered, refusal, tumortrack
@@ -36,7 +36,7 @@ from tumortrack.tracking.tracker import Tracker
 from warp_objects import PLACE_MM, TURNED, nudged, placed, shape_of
 
 CAMERA, SMALL = d405(424, 240), d405(320, 180)
-SHAPE = shape_of(compliant(organ(), 1.0))  # an ellipsoid looks the same after half a turn
+SHAPE = shape_of(bent(organ(), 1.0))  # an ellipsoid looks the same after half a turn
 ORGAN = SHAPE.anatomy_ct.organ
 INNER = (ORGAN.vertices_mm + ORGAN.vertices_mm.mean(0))[::5] / 2
 REST = ElasticMotion(SHAPE, TURNED, PLACE_MM, 0.0 * SHAPE.body.mean)

@@ -105,7 +105,9 @@ def test_the_way_there_and_back_is_none():
     undeformed = placed(share=0.0)
     np.testing.assert_allclose(undeformed.forward(points), rigid, atol=1e-3)
     homogeneous = np.column_stack([points, np.ones(len(points))])
-    np.testing.assert_allclose((homogeneous @ motion.camera_from_ct.T)[:, :3], rigid, atol=1e-9)
+    np.testing.assert_allclose(
+        (homogeneous @ motion.camera_from_deformed_ct.T)[:, :3], rigid, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize(

@@ -227,7 +227,7 @@ def test_the_command_says_where_points_of_the_ct_are(slim_model, stages, estimat
     report = json.loads((out / "report.json").read_text())
     assert report["map"]["points"] == 3
     rigid = np.array(report["motion"]["camera_from_ct"])
-    np.testing.assert_allclose(rigid[:3, :3] @ rigid[:3, :3].T, np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(rigid, estimate.camera_from_ct, atol=0.05)
     answered(tumortrack(*command, "--map", out / "points.csv", "--device", "cpu", "--overwrite"))
     assert list(csv.DictReader((out / "points.csv").open())) == rows
 

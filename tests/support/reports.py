@@ -16,7 +16,8 @@ from tumortrack.core.report import Finding, FitReport, NextEvidence
 from tumortrack.core.types import DepthFrame, SensorCloud, View
 
 NOWHERE = {
-    "camera_from_ct": [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]],
+    "camera_from_ct": np.eye(4).tolist(),
+    "camera_from_deformed_ct": np.eye(4).tolist(),
     **{
         "coefficients": [],
         "normalized_mahalanobis": 0.3,

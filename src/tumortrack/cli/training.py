@@ -104,7 +104,7 @@ class Train:
                 last = status
                 show(_progress(status), status.step == status.end)
 
-            about = train(report=report).provenance
+            about = train(on_status=report).provenance
         say(f"model written to {self.model}: {folder.training_words(about)}.")
         few = self.minutes is not None and last is not None and last.warming_up
         hint = "so few steps teach nearly nothing; train longer, or on a machine with less to do"

@@ -82,6 +82,6 @@ def _has(content: object, key: str) -> bool:
 
 
 def of_unknown_key(kind: type, fault: str) -> str:
-    """The hint for a key that msgspec does not know, by its message."""
-    found = re.search(r"unknown field `(\w+)`", fault)
-    return hint("keys", f"{kind.__name__}.{found[1]}") if found else ""
+    """The hint for a key, or a kind, that msgspec does not know, by its message."""
+    found = re.search(r"unknown field `(\w+)`|Invalid value '(\w+)'", fault)
+    return hint("keys", f"{kind.__name__}.{found[1] or found[2]}") if found else ""

@@ -249,13 +249,16 @@ class AllowedPoses(_Value, frozen=True, kw_only=True):
 
 
 class MotionReport(_Value, frozen=True, kw_only=True):
-    """The fitted motion: pose, elastic ``coefficients``, Gauss-Newton ``steps``.
+    """The fitted motion: the rigid transform nearest to it over the organ's surface
+    (``camera_from_ct``), and what it is made of: the pose of the deformed organ, elastic
+    ``coefficients``; Gauss-Newton ``steps``.
     ``normalized_mahalanobis``: of the library's state; ``compliance_std_mm``: of the compliance,
     whose coefficients are the last; ``misfit_mm``: what the library leaves of groups of
     neighbouring points, root mean square; ``depth_share``: standard deviation of the camera's
     depths, all alike, as a share of them."""
 
     camera_from_ct: tuple[tuple[float, float, float, float], ...]
+    camera_from_deformed_ct: tuple[tuple[float, float, float, float], ...]
     coefficients: tuple[float, ...]
     normalized_mahalanobis: float
     steps: int

@@ -26,6 +26,7 @@ from tumortrack.core.report import (
     SizeFit,
     SmoothingReport,
 )
+from tumortrack.core.rigid_fit import kabsch
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud, View
 from tumortrack.native import F32, F64, I32, kernel
 from tumortrack.registration.compliance import RefinedFit
@@ -154,7 +155,8 @@ class EstimateMaker:
                 allow_flip=found.prior.allow_flip,
             ),
             motion=MotionReport(
-                camera_from_ct=placed.motion.camera_from_ct.tolist(),
+                camera_from_ct=self._nearest_rigid(placed).tolist(),
+                camera_from_deformed_ct=placed.motion.camera_from_deformed_ct.tolist(),
                 coefficients=placed.motion.coefficients.tolist(),
                 normalized_mahalanobis=fit.motion.normalized_mahalanobis,
                 steps=refined.steps,
@@ -182,6 +184,11 @@ class EstimateMaker:
         """Prepare what the first estimate of a frame would wait for."""
         size = fit.views.apparent_size(fit.motion, self._model.config.refine)
         self._forward(self._placed(fit, refined, size), 0)
+
+    def _nearest_rigid(self, placed: _Placed) -> Float64[np.ndarray, "4 4"]:
+        rest = self._model.shape.anatomy_ct.organ.vertices_mm.astype(np.float64)
+        there = placed.meshes[self._model.parts[0]].vertices_mm.astype(np.float64)
+        return kabsch(rest, there, np.ones(len(rest)))
 
     def _placed(self, fit: RegistrationResult, refined: RefinedFit, size: SizeFit) -> _Placed:
         share = 0.0

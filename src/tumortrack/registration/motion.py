@@ -78,8 +78,8 @@ class ElasticMotion(Renamed):
     std_scale: float = 1.0
 
     @property
-    def camera_from_ct(self) -> Float64[np.ndarray, "4 4"]:
-        """The rigid part."""
+    def camera_from_deformed_ct(self) -> Float64[np.ndarray, "4 4"]:
+        """Where the flow has carried points of the CT -> camera."""
         return rigid(self.rotation, self.centre_mm - self.rotation @ self.shape.body.center_ct)
 
     @property

@@ -218,8 +218,11 @@ def _shifted(estimate: Estimate, by_mm: Float64[np.ndarray, " 3"]) -> Estimate:
     )
     motion, cost, volume = report.motion, report.fit_cost, estimate.volume
     if motion is not None:
-        camera_from_ct = (pose @ np.array(motion.camera_from_ct)).tolist()
-        motion = msgspec.structs.replace(motion, camera_from_ct=camera_from_ct)
+        motion = msgspec.structs.replace(
+            motion,
+            camera_from_ct=(pose @ np.array(motion.camera_from_ct)).tolist(),
+            camera_from_deformed_ct=(pose @ np.array(motion.camera_from_deformed_ct)).tolist(),
+        )
     if cost is not None:
         others = tuple(
             msgspec.structs.replace(
