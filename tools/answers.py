@@ -68,9 +68,8 @@ def measured(report: FitReport) -> dict[str, float]:
     known, cost = [std_mm for std_mm in deviations if std_mm is not None], report.fit_cost
     values = {
         "fit_cost": None if cost is None else cost.now / cost.usual,
-        "normalized_mahalanobis": None
-        if report.motion is None
-        else report.motion.normalized_mahalanobis,
+        # By the name under which it is recorded: the file's bytes are the fingerprint.
+        "rarity": None if report.motion is None else report.motion.normalized_mahalanobis,
         "unseen": report.unseen,
         "seen_through": report.seen_through,
         "unsure_mm": max(known, default=None),

@@ -366,7 +366,7 @@ def find_organ(
 
     Raises:
         NoEstimate: nothing is left that may be the organ, and which step took the rest; or what
-            was taught cannot be used on this picture.
+            was trained cannot be used on this picture.
         InputError: an option that is not allowed.
     """
     from tumortrack.registration.base_model import Model

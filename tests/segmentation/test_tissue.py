@@ -1,4 +1,4 @@
-"""The organ by colour and depth, taught by clicks: laws, known answers, and what is gained where
+"""The organ by colour and depth, trained by clicks: laws, known answers, and what is gained where
 depth alone cannot tell the organ from its surroundings."""
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ def clicks_of(frame, picture, on=ON, beside=BESIDE):
             for p in some]  # fmt: skip
 
 
-def find(frame, picture, taught):
-    hints = Hints(picture=picture, tissue_classifier=taught)
+def find(frame, picture, trained):
+    hints = Hints(picture=picture, tissue_classifier=trained)
     return organ_points(frame, CONFIG, hints, np.random.default_rng(0))
 
 
@@ -54,9 +54,9 @@ def test_colour_parts_what_is_one_thing_to_depth():
     u, _ = pixels(SMALL)
     alone = organ_points(frame, CONFIG, Hints(), np.random.default_rng(0))
     assert (alone.pixel_class == 0)[on].mean() > 0.9
-    taught = train_tissue_classifier(clicks_of(frame, picture))
-    assert taught.right == 1
-    region = find(frame, picture, taught)
+    trained = train_tissue_classifier(clicks_of(frame, picture))
+    assert trained.right == 1
+    region = find(frame, picture, trained)
     organ = region.pixel_class == 0
     assert region.doubt == ""
     assert organ[on & (u < 205)].mean() > 0.95
@@ -65,7 +65,7 @@ def test_colour_parts_what_is_one_thing_to_depth():
     assert sum(region.counts.values()) == organ.size
     # Python's way, and of a picture twice as large: every second pixel is looked at.
     same = tt.train_tissue_classifier(frame, picture, ON, BESIDE)
-    assert np.array_equal(same.centres, taught.centres)
+    assert np.array_equal(same.centres, trained.centres)
     cloud = tt.find_organ(frame, range_mm=(60, 400), picture=picture, tissue_classifier=same)
     assert cloud.points_mm[:, 0].max() < 2
 
@@ -74,8 +74,8 @@ def test_the_order_of_clicks_changes_nothing():
     frame, picture, _ = two_tissues()
     clicks = clicks_of(frame, picture)
     first, second = (
-        find(frame, picture, taught)
-        for taught in (
+        find(frame, picture, trained)
+        for trained in (
             train_tissue_classifier(clicks),
             train_tissue_classifier([clicks[k] for k in (5, 0, 3, 6, 1, 4, 2)]),
         )
@@ -86,12 +86,12 @@ def test_the_order_of_clicks_changes_nothing():
 
 def test_exposure_and_shading_change_hardly_a_pixel():
     frame, picture, on = two_tissues()
-    taught = train_tissue_classifier(clicks_of(frame, picture))
-    as_taught = find(frame, picture, taught).pixel_class == 0
+    trained = train_tissue_classifier(clicks_of(frame, picture))
+    as_taught = find(frame, picture, trained).pixel_class == 0
     shades = (0.5, 0.75, 1.15, np.linspace(0.6, 1.1, SMALL.width)[:, None])
     for shade in shades:
         other = np.clip(picture * shade, 0, 255).astype(np.uint8)
-        changed = (find(frame, other, taught).pixel_class == 0) != as_taught
+        changed = (find(frame, other, trained).pixel_class == 0) != as_taught
         assert changed.sum() < 0.02 * on.sum()
 
 
@@ -114,19 +114,19 @@ def test_clicks_that_do_not_tell_are_refused():
 
 def test_where_it_cannot_be_used_depth_decides_and_it_is_said():
     frame, picture, _ = two_tissues()
-    taught = train_tissue_classifier(clicks_of(frame, picture))
+    trained = train_tissue_classifier(clicks_of(frame, picture))
     alone = organ_points(frame, CONFIG, Hints(), np.random.default_rng(0))
     blue, dark = (
         np.clip(picture * gain, 0, 255).astype(np.uint8) for gain in ([0.3, 0.7, 2], 0.02)
     )
     grey = np.repeat(picture.mean(-1, keepdims=True).astype(np.uint8), 3, axis=2)
     for other in (None, blue, dark, grey):
-        region = find(frame, other, taught)
+        region = find(frame, other, trained)
         assert region.doubt
         assert np.array_equal(region.pixel_class, alone.pixel_class)
-    assert find(SensorCloud(deproject(frame)), picture, taught).doubt
+    assert find(SensorCloud(deproject(frame)), picture, trained).doubt
     with pytest.raises(NoEstimate):
-        tt.find_organ(frame, range_mm=(60, 400), picture=blue, tissue_classifier=taught)
+        tt.find_organ(frame, range_mm=(60, 400), picture=blue, tissue_classifier=trained)
 
 
 def test_grey_pictures_teach_only_large_differences():
@@ -136,8 +136,8 @@ def test_grey_pictures_teach_only_large_differences():
         train_tissue_classifier(clicks_of(frame, grey))
     u, _ = pixels(SMALL)
     grey[~on | (u > 212)] = 14 + grey[~on | (u > 212)] // 20
-    taught = train_tissue_classifier(clicks_of(frame, grey))
-    organ = find(frame, grey, taught).pixel_class == 0
+    trained = train_tissue_classifier(clicks_of(frame, grey))
+    organ = find(frame, grey, trained).pixel_class == 0
     assert organ[on & (u < 205)].mean() > 0.9
     assert organ[on & (u > 219)].mean() < 0.05
 
@@ -201,9 +201,9 @@ def test_what_clicks_gain_in_scenes(kind, kidneys):
 
 
 def test_fat_of_the_organs_colour_is_told_by_nobody(kidneys):
-    taught = 0
+    trained = 0
     for seed in range(SCENES):
         scene, picture, clicks = scene_with_colours(kidneys, KINDS["fat"][0], seed, same=True)
         with suppress(InputError):
-            taught += not find(scene.frame, picture, train_tissue_classifier(clicks)).doubt
-    assert taught <= 0.1 * SCENES
+            trained += not find(scene.frame, picture, train_tissue_classifier(clicks)).doubt
+    assert trained <= 0.1 * SCENES

@@ -1,4 +1,4 @@
-"""The organ is found in another piece of the image where the likeliest one is something else."""
+"""The organ is found in another piece of the image where the most likely one is something else."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tumortrack.core.render import render_depth
 from tumortrack.core.types import SensorCloud, View
 from tumortrack.segmentation import Hints
 from tumortrack.tracking.options import LocateOptions
-from tumortrack.tracking.pieces import likeliest_piece
+from tumortrack.tracking.pieces import select_piece
 from tumortrack.tracking.views import ViewFile, as_fitted
 from warp_objects import ANATOMY, placed
 
@@ -62,7 +62,7 @@ def test_what_is_the_organ_is_tried_alone_and_what_is_not_to_the_end(tracker, im
     for first, others, count in ((organ, (plate,), 1), (plate, (plate, organ, plate), 4)):
         tries.clear()
         view = View(replace(first, others=others), seen, np.eye(4))
-        likeliest_piece((view,), located)
+        select_piece((view,), located)
         assert len(tries) == count
 
 

@@ -69,7 +69,7 @@ class SmallBench:
             picture[0] = config.number[0] % 200
         name = config.frame_id or None
         observation = Observation(frame, stamp_ns + 1000, frame_id=name, picture=picture)
-        config.pixel_class.append(observation)
+        config.taken.append(observation)
         return observation
 
     def close(self) -> None:

@@ -83,7 +83,7 @@ def in_organ(located: Located, points_mm: np.ndarray) -> np.ndarray:
 
 def keeps(plan: ResectionPlan) -> dict[str, float]:
     """Of all that the electrode keeps away from."""
-    return {**dict.fromkeys(plan.pixel_class, plan.margin_mm), **plan.keep_mm}
+    return {**dict.fromkeys(plan.taken, plan.margin_mm), **plan.keep_mm}
 
 
 def gap_mm(plan: ResectionPlan, mesh: Mesh, tools: Tools = Tools()) -> float:  # noqa: B008
@@ -107,7 +107,7 @@ def holds(plan: ResectionPlan, located: Located, config: ResectionConfig, tools:
     depths = -beyond(plan.facets, located.meshes[plan.tumor].vertices_mm).max(0)
     room_mm = plan.margin_mm + tools.radius_mm
     assert (depths >= room_mm - 1e-9).all()
-    if len(plan.pixel_class) == 1:
+    if len(plan.taken) == 1:
         assert (depths <= room_mm + 0.1 + 1e-9).all()
     for number, (cut, plane) in enumerate(zip(plan.cuts, plan.facets, strict=True)):
         ends = swept(cut, tools.electrode_mm)

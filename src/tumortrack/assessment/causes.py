@@ -1,4 +1,4 @@
-"""Likely causes of a poor estimate, or of none, the likeliest first, and what to do about them.
+"""Likely causes of a poor estimate, or of none, the most likely first, and what to do about them.
 
 Each cause needs evidence. Points that fit as well as usual once a cause is undone (turned to the
 camera, mirrored, in another unit, scaled in x and y) have that cause; the others follow from how
@@ -105,7 +105,7 @@ def check_of(estimate: Estimate | None) -> str:
 def likely_causes(
     model: Model, cloud: SensorCloud, estimate: Estimate | None
 ) -> tuple[Likely, ...]:
-    """The causes with evidence, the likeliest first; at least one.
+    """The causes with evidence, the most likely first; at least one.
 
     Args:
         cloud: the organ's points, camera frame, in which it was located.
@@ -128,8 +128,8 @@ def likely_causes(
 
 
 def words(causes: tuple[Likely, ...], view: str) -> str:
-    """The two likeliest causes, and what to do about the first. ``view``: from where to look, given
-    for causes that another view may resolve."""
+    """The two most likely causes, and what to do about the first. ``view``: from where to look,
+    given for causes that another view may resolve."""
     parts = []
     for cause, number in ((likely.cause, likely.number or 0.0) for likely in causes[:2]):
         unit = Unit(number).of_cloud if cause is Cause.UNIT else ""

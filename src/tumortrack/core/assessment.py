@@ -37,7 +37,7 @@ class Assessment(msgspec.Struct, frozen=True, kw_only=True):
         factor: by which they were multiplied, as found on scenes of known truth (``tumortrack
             margins``).
         finding: why it is poor (see ``assessment.verdict.judged``); None: it is good.
-        causes: of a poor one, the likeliest first: see ``assessment.causes``.
+        causes: of a poor one, the most likely first: see ``assessment.causes``.
         advice: sentences after the finding's: what probably happened and what to do.
         next_evidence: what to learn next, the best first.
     """

@@ -62,8 +62,8 @@ class PackageError(InputError):
 class NoEstimate(TumortrackError):
     """The input is well formed but allows no answer (too few points, no organ).
 
-    ``finding``: the reason by its kind; None where none was given. ``causes``: the likeliest first,
-    where they were looked for. ``advice``: what they mean and what to do, in words."""
+    ``finding``: the reason by its kind; None where none was given. ``causes``: the most likely
+    first, where they were looked for. ``advice``: what they mean and what to do, in words."""
 
     exit_code = EXIT_STATUSES["none"]
 

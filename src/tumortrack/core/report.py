@@ -284,7 +284,8 @@ class FitReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
         in_sight: share of it that nothing hides.
         doubted_in_sight: ``in_sight`` when the camera last saw through it.
         cameras: numbers of those that saw it, where there are several.
-        piece: of the first image, in which it was found; 0: the likeliest (``SensorCloud.others``).
+        piece: of the first image, in which it was found; 0: the most likely
+        (``SensorCloud.others``).
         peer: of a method beside this one: what it says of its fit.
     """
 

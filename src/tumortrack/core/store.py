@@ -155,24 +155,24 @@ def check_place(path: Path, kind: str, overwrite: bool | None) -> None:
             f"{path} is not a {kind} that tumortrack wrote, so it is not replaced. "
             "Choose another path, or move the folder away yourself."
         )
-    if strays := _strays(path, manifest):
+    if foreign := _foreign(path, manifest):
         raise InputError(
-            f"{path} also holds {', '.join(strays[:3])}, which would be lost. Move it away first, "
+            f"{path} also holds {', '.join(foreign[:3])}, which would be lost. Move it away first, "
             "or choose another path."
         )
 
 
-def _strays(folder: Path, manifest: dict[str, Any]) -> list[str]:
+def _foreign(folder: Path, manifest: dict[str, Any]) -> list[str]:
     """Files in an artifact, and in the artifacts inside it, that their manifests do not list."""
     files, folders = manifest.get("files", {}), manifest.get("folders", ())
-    strays = []
+    foreign = []
     for path in sorted(folder.iterdir()):
         if path.name in folders and (path / MANIFEST).is_file():
-            inner = _strays(path, read_json(path / MANIFEST))
-            strays += [f"{path.name}/{name}" for name in inner]
+            inner = _foreign(path, read_json(path / MANIFEST))
+            foreign += [f"{path.name}/{name}" for name in inner]
         elif path.name not in (MANIFEST, *files) and not path.name.startswith("."):
-            strays.append(path.name)
-    return strays
+            foreign.append(path.name)
+    return foreign
 
 
 @contextmanager

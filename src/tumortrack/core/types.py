@@ -263,7 +263,7 @@ class SensorCloud:
     """Points seen by the sensor, camera frame, mm, float32, all finite. ``noise``: of the points,
     as measured; None: not yet. ``candidates_mm``: points beside them that may be the organ's too,
     as dense as they are. ``depth_error``: of the camera; None: nobody has stated it. ``others``:
-    what else in the image may be the organ instead, the likeliest first."""
+    what else in the image may be the organ instead, the most likely first."""
 
     points_mm: Float32[np.ndarray, "n 3"]
     stamp_ns: int = 0

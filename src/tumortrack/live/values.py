@@ -370,17 +370,17 @@ class Controls:
             )
         ((column, row),), _ = project(place_mm[None], seen.content.intrinsics)
         new = sample_click(seen.content, seen.picture, (round(row), round(column)), organ)
-        clicks, taught = (*self.clicks, new), None
+        clicks, trained = (*self.clicks, new), None
         try:
-            taught = train_tissue_classifier(clicks)
-            state = f"in use: {100 * taught.right:.0f} % of a click are told by the others"
+            trained = train_tissue_classifier(clicks)
+            state = f"in use: {100 * trained.right:.0f} % of a click are told by the others"
         except InputError as error:
             state = f"not in use: {error}"
         count = sum(click.organ for click in clicks)
-        # At once: no frame in between may be without what former clicks taught.
+        # At once: no frame in between may be without what former clicks trained.
         self.clicks, self.tissue_classifier, self.colour = (
             clicks,
-            taught,
+            trained,
             f"clicks: {count} on the organ, {len(clicks) - count} beside it; {state}",
         )
 

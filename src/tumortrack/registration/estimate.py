@@ -51,7 +51,7 @@ _look_up = kernel("look_up", F32[3], I32["i", "j", "k"], F32["n", 3], float, I32
 
 
 class Found(NamedTuple):
-    """A frame's fit; the prior by which it is the likeliest; its motion as the points alone show
+    """A frame's fit; the prior by which it is the most likely; its motion as the points alone show
     it; evidence by now, and that part of it, as it came, which is of earlier frames."""
 
     fit: RegistrationResult

@@ -40,7 +40,7 @@ _MOST_KEPT = 200  # from frame to frame, the newest: a frame then takes three ti
 @dataclass(frozen=True, eq=False)
 class Terms:
     """Residuals at a motion, one a row, and how much each counts. ``by_shifts``: what one standard
-    deviation of each tool's shift does; the likeliest ``shifts`` are left out of the equations
+    deviation of each tool's shift does; the most likely ``shifts`` are left out of the equations
     (Schur complement)."""
 
     residuals_mm: Float64[np.ndarray, " t"]
@@ -84,7 +84,7 @@ class Terms:
 
     @cached_property
     def shifts(self) -> Float64[np.ndarray, " s"]:
-        """The likeliest at this motion, in standard deviations."""
+        """The most likely at this motion, in standard deviations."""
         slope = (self.by_shifts.T * self.weights) @ self.residuals_mm
         return -np.linalg.solve(self._own_precision, slope)
 

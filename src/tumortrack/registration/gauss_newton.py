@@ -89,7 +89,7 @@ class RegistrationResult:
         pose_offset: shift (mm) and turn (rad) from where the prior has the pose.
         terms: of the evidence, at the motion.
         alternatives: other minima that explain the points nearly as well; ``excluded_pose``: one
-            that explains them better, in a pose that is excluded (see ``registration.likeliest``).
+            that explains them better, in a pose that is excluded (see ``registration.select_best``).
     """
 
     motion: ElasticMotion

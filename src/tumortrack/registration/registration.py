@@ -6,7 +6,7 @@
    certain: one side leaves the turn about the organ's long axis nearly free, and there are local
    minima on the way.
 3. Correct (`looks`): where there are several cameras, their places and the motion in turns.
-4. Choose (`likeliest`, below): by cost, and by how the organ may lie, which the case says. Other
+4. Choose (`select_best`, below): by cost, and by how the organ may lie, which the case says. Other
    minima that explain the points nearly as well, and put a tumor elsewhere, are kept as
    alternatives; one that explains them better in a pose that the case excludes makes the answer
    poor.
@@ -90,7 +90,7 @@ class Registration:
         timed: Timer = nullcontext,
         again: bool = False,
     ) -> RegistrationResult:
-        """The likeliest fit to one or several looks at a still organ, wherever it lies.
+        """The most likely fit to one or several looks at a still organ, wherever it lies.
 
         Args:
             known: a fit of these looks, which is kept if it is best.
@@ -150,7 +150,7 @@ class Registration:
         starts: Sequence[ElasticMotion],
         known: RegistrationResult | None = None,
     ) -> RegistrationResult:
-        """The likeliest fit with the cameras as stated, from all starts and from some beside the
+        """The most likely fit with the cameras as stated, from all starts and from some beside the
         best. ``known``: a fit of before."""
         fits = [] if known is None else [known]
         new = [Start(motion) for motion in starts if far_from(motion, [fit.motion for fit in fits])]
@@ -201,7 +201,7 @@ def cost_with_prior(fit: RegistrationResult, prior: PosePrior) -> float:
 
 
 def select_best(fits: Sequence[RegistrationResult], prior: PosePrior) -> RegistrationResult:
-    """The likeliest of these fits and their others, by cost and prior of the pose.
+    """The most likely of these fits and their others, by cost and prior of the pose.
 
     Its alternatives are those that are less likely by ``RIVAL_COST`` at most and put the middle of
     a part where neither its covariance nor those of likelier alternatives have it; its motion has

@@ -217,5 +217,5 @@ def _remove_other_tissue(
     try:
         image.remove(hints.tissue_classifier.other_tissue(image, colours), COLOUR)
     except NoEstimate as error:
-        return f"what the clicks taught is not used: {error}"
+        return f"the classifier trained by the clicks is not used: {error}"
     return ""

@@ -1,5 +1,5 @@
 """Choose the organ's piece: the one that the user picked, that the last estimate points to, or the
-likeliest; and what lies wholly in the last estimate's box."""
+most likely; and what lies wholly in the last estimate's box."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _measures = kernel(
 
 def choose_pieces(image: WorkingImage, config: RegionConfig, hints: Hints) -> list[np.ndarray]:
     """Remove all but the organ's piece and what belongs to it.
-    Returns the masks of the next likeliest pieces, unless hints say which one it is. Raises
+    Returns the masks of the next most likely pieces, unless hints say which one it is. Raises
     NoEstimate: no piece lies within 10 mm of the picked point.
 
     Surroundings level with the organ, or a hand that touches it, make one large piece with it that
@@ -116,7 +116,7 @@ def _chosen(
     poor: float,
 ) -> tuple[np.ndarray, float, bool]:
     """Which piece (count + 1,) of one split of the image is the organ: the one that the hints
-    select, else the likeliest (the largest of an organ's size; what leaves the image counts less,
+    select, else the most likely (the largest of an organ's size; what leaves the image counts less,
     as arms do). Its score; and whether it is doubtful, so that another split may be better: it
     leaves the image, is too wide, or less like an organ than ``poor`` beside something larger that
     leaves the image."""

@@ -17,7 +17,7 @@ _UNDETERMINED = 2.0  # times the radius that makes an answer poor
 _ELSEWHERE = "fit", "outliers", "seen_through", "size"  # checks that speak for another piece
 
 
-def likeliest_piece(
+def select_piece(
     views: Sequence[View], located: Callable[[Sequence[View]], Estimate], most: int | None = None
 ) -> tuple[Estimate, Sequence[View]]:
     """The estimate in the first view's points or, where these are not the organ, in another piece

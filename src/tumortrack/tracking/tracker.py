@@ -33,7 +33,7 @@ from tumortrack.registration.motion import ElasticMotion, seen_from_first
 from tumortrack.segmentation import RegionConfig
 from tumortrack.segmentation.smoothing import clean_cloud
 from tumortrack.tracking.model_files import case_model
-from tumortrack.tracking.pieces import likeliest_piece
+from tumortrack.tracking.pieces import select_piece
 
 _DEFAULTS = FollowOptions()
 _BEFORE_MM = np.array([0.0, 0.0, 300.0])  # of a camera that there is not
@@ -145,7 +145,7 @@ class Tracker:
             return judged(found, all_views, factor=self.model.bound_factor)
 
         with self._explaining_errors(all_views, _DEFAULTS, bool(pieces)):
-            estimate, all_views = likeliest_piece(all_views, located)
+            estimate, all_views = select_piece(all_views, located)
         return assessed(estimate, all_views, self.model, advise="all", part=self._advised)
 
     def follow(
@@ -174,7 +174,7 @@ class Tracker:
             return judged(found, all_views, strictly, self.model.bound_factor, last)
 
         with self._explaining_errors(all_views, how, bool(pieces or (last and last.evidence))):
-            estimate, all_views = likeliest_piece(
+            estimate, all_views = select_piece(
                 all_views, located, most=1
             )  # a frame may not wait
         advise: Advise = "touches" if how.global_search else "nothing"

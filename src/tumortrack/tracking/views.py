@@ -253,6 +253,6 @@ def as_fitted(
     for view, organ, way in zip(views, found, ways, strict=True):
         width_mm = kernel_width_mm(refine, organ.cloud.noise or PointNoise())
         there = seen_from_first(motion, np.linalg.inv(way))
-        piece = 0 if out else estimate.report.piece  # further views have their likeliest
+        piece = 0 if out else estimate.report.piece  # further views have their most likely one
         out.append(view.fitted(organ, there, FARTHEST * width_mm, piece))
     return out

@@ -3,7 +3,7 @@
 
 // -2 log of the evidence of the prior that ``explained`` (n, n; J C J', mm^2) follows from, for the
 // distances d + J x with robust weights W, up to a constant; NaN where the system has no solution.
-// The likeliest x is -C J' z, where z = (J C J' + 1 / W)^-1 d: a small system, since the means are
+// The most likely x is -C J' z, where z = (J C J' + 1 / W)^-1 d: a small system, since the means are
 // fewer than the unknowns. Its determinant, times W's, is that of the posterior's precision over the
 // prior's.
 struct linear_cost {
