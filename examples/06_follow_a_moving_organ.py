@@ -24,7 +24,7 @@ class PrintingSink:
             print(f"none: {result.reason}")  # never the last answer again
             return
         self.estimates += 1
-        middle, off_mm = placed.meshes["tumor_1"].box_mm.mean(0), np.nan
+        middle, off_mm = result.center_mm("tumor_1"), np.nan
         if result.observation is not None and result.observation.truth is not None:
             true_mm = result.observation.truth.tumors[0].box_mm.mean(0)
             off_mm = float(np.linalg.norm(middle - true_mm))

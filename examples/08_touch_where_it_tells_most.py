@@ -40,7 +40,10 @@ def main(out: Path) -> None:
         estimate = tracker.locate(cloud, grid=48, evidence=touches)
         tell(f"{len(touches)} touches", estimate, scene.targets)
     for each in estimate.report.evidence:
-        print(f"{each.name}: {each.off_mm:.1f} mm from the answer, {each.news:.0%} of it news")
+        print(
+            f"{each.name}: {each.off_mm:.1f} mm from the answer, "
+            f"{each.information_gain:.0%} of it new"
+        )
 
 
 def tell(known: str, estimate: tt.Estimate, targets: Any) -> None:

@@ -177,7 +177,7 @@ def rows_of(tracker: Tracker, scene: Scene, seed: int) -> Iterator[dict[str, Any
         pieces = [piece.evidence for piece in source.drawn(asked.evidence)]
         cloud = _NO_CLOUD if asked.alone else asked.scene.cloud
         try:
-            found = tracker.locate(cloud, grid=8, seen=asked.seen, evidence=pieces)
+            found = tracker.locate(cloud, grid=8, full_view=asked.full_view, evidence=pieces)
         except NoEstimate:
             continue
         rigid_mm = rigid_centers_mm(model, asked.scene) if number == 0 else {}
@@ -189,7 +189,7 @@ def rows_of(tracker: Tracker, scene: Scene, seed: int) -> Iterator[dict[str, Any
                     "answer": number,
                     "family": scene.meta["family"],
                     "segmentation_mm": (scene.meta["segmentation"].get("rms_mm") or [0.0])[0],
-                    "by": "cloud" if asked.seen is None else "image",
+                    "by": "cloud" if asked.full_view is None else "image",
                     "evidence": kinds,
                     "part": name,
                     "largest_error_mm": largest_mm,

@@ -151,7 +151,7 @@ def _views(
         to_camera = view.camera_from_bench
         meta: dict[str, Any] = {
             **state.about,
-            "words": shot.message,
+            "words": shot.words,
             "state": shot.state,
             **view.about,
             "attempt": attempt,

@@ -146,7 +146,9 @@ class _Asker:
     def located(self, pieces: Pieces) -> Estimate | None:
         known, scene = [piece.evidence for piece in pieces], self.scene
         try:
-            return self.tracker.locate(scene.cloud, grid=_COARSE, seen=scene.depth, evidence=known)
+            return self.tracker.locate(
+                scene.cloud, grid=_COARSE, full_view=scene.depth, evidence=known
+            )
         except NoEstimate:
             return None
 
@@ -258,7 +260,7 @@ def _rows(
         **more,
     }
     if estimate is not None and pieces:
-        out = [told.left_out for told in estimate.report.evidence]
+        out = [told.rejected for told in estimate.report.evidence]
         about["false_out"] = sum(o for o, p in zip(out, pieces, strict=True) if p.false)
         about["true_out"] = sum(o for o, p in zip(out, pieces, strict=True) if not p.false)
     for tumor, off in _off_mm(asker.scene, estimate).items():

@@ -317,7 +317,7 @@ def _row(tracker: Tracker, scene: Scene, condition: Condition, seed: int) -> dic
             rng = np.random.default_rng(0)
             cloud = organ_points(seen, region_for(model), Hints(), rng).cloud
         assert isinstance(cloud, SensorCloud)
-        estimate = tracker.locate(cloud, grid=16, seen=seen)
+        estimate = tracker.locate(cloud, grid=16, full_view=seen)
     except NoEstimate as error:
         check = error.finding.check if error.finding else "none"
         return {"quality": "none", "check": check, "seconds": time.perf_counter() - start}

@@ -118,7 +118,7 @@ class Answer:
 
     fault: Fault
     named_s: float = np.nan
-    words: str = ""
+    message: str = ""
     back_s: float = np.nan
     good: int = 0  # estimates called good while it was on
 

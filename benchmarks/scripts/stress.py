@@ -135,7 +135,7 @@ def _planned(
         "code": scripting.code_sha256([*code, Path(tumortrack_benchmarks.physics.cut.__file__)]),
     }
     methods: dict[str, Locate] = {
-        "model": lambda scene: tracker.locate(scene.cloud, grid=_GRID, seen=scene.depth),
+        "model": lambda scene: tracker.locate(scene.cloud, grid=_GRID, full_view=scene.depth),
         "truth": truth,
     }
     for name, (method, locate) in product(made, methods.items()):
@@ -229,7 +229,7 @@ def cut_one(scene_folder: Path, tumors: list[str], locate: Locate) -> Iterator[d
         for tumor, planner in product(tumors, PLANNERS):
             yield {"tumor": tumor, "planner": planner.name, "refused": str(error)}
         return
-    located = of_estimate(estimate).with_vertices(table_from_camera)
+    located = of_estimate(estimate).transformed(table_from_camera)
     for tumor, planner in product(tumors, PLANNERS):
         if not planner.with_errors or tumor in located.bounds_mm:  # others know no bound
             row = {"tumor": tumor, "planner": planner.name, "good": estimate.quality == "good"}

@@ -121,7 +121,7 @@ def test_a_ratio_is_the_farthest_vertex_over_its_bound(ready_case, scenes):
     tracker = Tracker(replace(model, bound_factor=4.0))  # not counted: it would be found anew
     path, row = good_row(Locating(tracker, 0), scenes)
     scene = read_scene(path)
-    found = Tracker(model).locate(scene.cloud, grid=8, seen=scene.depth)
+    found = Tracker(model).locate(scene.cloud, grid=8, full_view=scene.depth)
     ratios = []
     for rest, true, name in zip(
         tracker.anatomy_ct.tumors, scene.reference.tumors, model.parts[1:], strict=True

@@ -106,7 +106,9 @@ def made(case_folder, tmp_path_factory):
 
 def test_a_camera_over_a_tall_organ_is_raised(case_folder, tmp_path):
     tall = load_case(case_folder).anatomy
-    tall = tall.of(part.with_vertices(part.vertices_mm * [1, 1.6, 1]) for part in tall.parts)
+    tall = tall.with_parts(
+        part.with_vertices(part.vertices_mm * [1, 1.6, 1]) for part in tall.parts
+    )
     bench = Bench.from_anatomy(tall, UP, tmp_path / "tets")
     far_mm = 3.2 * HALF_HEIGHT + 85
     meta = make_scene(bench, squeeze(bench, "D0"), "D0", "clean", 0).meta

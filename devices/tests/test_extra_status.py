@@ -139,7 +139,7 @@ def test_without_an_estimate_nothing_is_advised_nor_afterwards():
 
 def test_what_contradicts_stays_in_sight_for_seconds_and_free_places_are_left_out():
     extra_status = ExtraStatus()
-    known = {"touch": (KNOWN_MM, False), "free": (FREE_MM, False)}
+    known = {"touch": (KNOWN_MM, False), "free_space": (FREE_MM, False)}
     extra_status.update(told(**known, outline=(FAR_MM, True)))
     known_mm, far_mm = transform_points(ROBOT.published_from_camera, np.array([KNOWN_MM, FAR_MM]))
     for second in (1, 3):

@@ -71,7 +71,7 @@ def test_types_agree_with_a_second_encoder(kind: str, messages: Messages) -> Non
     seen = Observation(small_frame(), 0)
     cloud = Observation(SensorCloud(points_mm()[:7], 12_000_000_034), 0)
     made = [*messages_seen(seen, messages), *messages_seen(cloud, messages)]
-    made += ResultMessages(messages, with_arms()).of(working())
+    made += ResultMessages(messages, with_arms()).messages(working())
     if kind == SCENE:
         message = messages.make(SCENE, name="room", is_diff=True, robot_state={"is_diff": True})
     else:
@@ -233,7 +233,7 @@ def test_the_view_for_rviz_shows_what_is_published(
     """Topics, frame and reliability of the views are the sink's."""
     folder = IDENTITY.parents[1] / "integrations" / "ros2" / "tumortrack_ros" / "rviz"
     view = (folder / name).read_text(encoding="utf-8")
-    out = ResultMessages(messages, with_arms()).of(empty_update())
+    out = ResultMessages(messages, with_arms()).messages(empty_update())
     sent = {one.topic("/tumortrack") for one in out}
     shown = set(re.findall(r"Value: (/tumortrack\S+)", view))
     assert sorted(shown) == [f"/tumortrack/{topic}" for topic in topics]

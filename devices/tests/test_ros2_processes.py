@@ -148,7 +148,8 @@ def test_updates_reach_another_process(by: str, messages: Messages) -> None:
     assert isinstance(sink, Sink)
     update = small_update()
     expected = {
-        one.suffix: one.message for one in ResultMessages(messages, small_setting()).of(update)
+        one.suffix: one.message
+        for one in ResultMessages(messages, small_setting()).messages(update)
     }
     try:
         with peer("hear", 600, by=by) as other:
@@ -189,7 +190,7 @@ def test_what_is_kept_reaches_a_node_that_comes_later(bus: Bus, messages: Messag
     publish = bus.publisher("/tumortrack/planned", MARKERS, latched=True)
     out = {
         one.suffix: one.message
-        for one in ResultMessages(messages, small_setting()).of(small_update())
+        for one in ResultMessages(messages, small_setting()).messages(small_update())
     }
     publish(messages.to_bytes(out["meshes"]))
     with peer("hear", 600, by=RCLPY) as other:

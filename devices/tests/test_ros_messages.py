@@ -399,7 +399,7 @@ def test_stamps_that_ros_cannot_say_are_refused(stamp_ns):
 def test_bytes_are_those_of_plain_messages(update):
     """Blocks of points are written as the library writes lists of points."""
     stock = get_typestore(Stores.ROS2_HUMBLE)
-    for out in ResultMessages(HUMBLE, with_arms()).of(update):
+    for out in ResultMessages(HUMBLE, with_arms()).messages(update):
         raw, kind = HUMBLE.to_bytes(out.message), out.message_type
         again = stock.serialize_cdr(stock.deserialize_cdr(raw, kind), kind)
         assert bytes(again) == bytes(raw), out.suffix

@@ -98,7 +98,7 @@ def test_the_organ_is_located_by_it(seen, elastic_model):
     model = replace(model, config=msgspec.structs.replace(model.config, scene=scene))
     assert region_for(model).noise_mm == STEREO_NOISE.axial_mm
     organ = api.find_organ(seen.frame, model=model)
-    estimate = Tracker(model).locate(organ, grid=16, seen=seen.frame)
+    estimate = Tracker(model).locate(organ, grid=16, full_view=seen.frame)
     for name, part in zip(model.parts, seen.case.anatomy.parts, strict=True):
         true_mm = transform_points(seen.rectified_from_ct, part.vertices_mm).mean(0)
         assert np.linalg.norm(estimate.meshes[name].vertices_mm.mean(0) - true_mm) < 3.0, name

@@ -243,10 +243,12 @@ def test_a_tool_whose_poses_end_gives_nothing_and_says_so_once(tmp_path):
     tools = Tools(configs, setting(), notes)
     assert len(tools.evidence(view(STAMP_NS + 100 * MS))) == 2  # the pose 10 ms before
     for time_ms in (200, 300, 400):
-        assert [p for p in tools.evidence(view(STAMP_NS + time_ms * MS)) if p.name == "free"] == []
+        assert [
+            p for p in tools.evidence(view(STAMP_NS + time_ms * MS)) if p.name == "free_space"
+        ] == []
     assert len(notes) == 1
     assert tools.summary() == {
-        "probe": {"touch": 1, "free": 1, "trouble": [notes[0].removeprefix("tool probe: ")]}
+        "probe": {"touch": 1, "free_space": 1, "trouble": [notes[0].removeprefix("tool probe: ")]}
     }
 
 
@@ -272,7 +274,7 @@ def test_a_table_without_contacts_serves_for_a_shaft_alone(tmp_path):
     with refused(InputError, path):
         FileToolConfig(path=path).open(setting(), "probe")
     tool = FileToolConfig(path=path, shaft_mm=10.0).open(setting(), "probe")
-    assert [piece.name for piece in tool.evidence(view(STAMP_NS))] == ["free"]
+    assert [piece.name for piece in tool.evidence(view(STAMP_NS))] == ["free_space"]
 
 
 # OpenIGTLink
@@ -525,7 +527,7 @@ def test_a_tool_of_tf_touches_as_its_topic_says():
 
         try:
             frees = until(lambda: at(time.time_ns() - 30 * MS), "the shaft")
-            assert [piece.name for piece in frees] == ["free"]
+            assert [piece.name for piece in frees] == ["free_space"]
 
             def touched():
                 pressing(True)

@@ -97,9 +97,9 @@ def test_a_replay_with_the_evidence_of_tools_is_the_same_to_the_last_bit(world, 
     succeeded(tumortrack("track", world.model, *run))
     counts = told(report)["tools"]
     assert counts["probe"]["touch"] >= 2
-    assert counts["shaft"]["free"] >= len(stamps) / 2
+    assert counts["shaft"]["free_space"] >= len(stamps) / 2
     given = evidence(first)
-    assert {piece.name for known in given.values() for piece in known} == {"touch", "free"}
+    assert {piece.name for known in given.values() for piece in known} == {"touch", "free_space"}
     run = f"recording:{first}?rate=0", f"recording:{again}", "--report", tmp_path / "again.json"
     succeeded(tumortrack("track", world.model, *run))
     assert evidence(again) == given

@@ -157,7 +157,7 @@ def test_what_neither_moves_nor_deforms_is_sent_once_and_kept_for_latecomers():
     def out(n, *more):
         cell = working(n, 0.1 * n).control
         update = replace(working(n), control=replace(cell, shapes=(*more, *cell.shapes)))
-        return {one.suffix: one for one in messages.of(update)}
+        return {one.suffix: one for one in messages.messages(update)}
 
     first = out(0, *planned)
     names = [marker.ns for marker in first["planned"].message.markers]

@@ -190,7 +190,8 @@ def test_the_pull_itself_halts_nothing_and_then_it_is_planned_on_the_pulled_tumo
 def test_a_grip_that_slips_halts_the_arms():
     procedure = Procedure()
     procedure.until("sweep 1")
-    slipped = [{"name": "held", "std_mm": 1.2, "off_mm": 11.6, "news": 0.0, "left_out": True}]
+    errors = {"std_mm": 1.2, "off_mm": 11.6, "information_gain": 0.0}
+    slipped = [{"name": "grasp", **errors, "rejected": True}]
     for quality in ("good", "poor"):  # whatever else is thought of it
         cell = procedure.frame(seen(quality, evidence=slipped))
         assert (cell.halt.kind, cell.halt.values["off_mm"]) == ("slipped", 11.6)

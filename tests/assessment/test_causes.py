@@ -91,7 +91,7 @@ def answer(tracker: Tracker, points: np.ndarray) -> tuple[str, str, tuple[Likely
 
 def test_a_right_cloud_is_good_and_has_no_cause_and_metres_are_refused_as_such(tracker, points):
     assert answer(tracker, points) == ("good", "", ())
-    with refused(InputError, "--unit m"):
+    with refused(InputError, "1000"):
         answer(tracker, points / 1000)
 
 

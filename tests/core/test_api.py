@@ -26,7 +26,7 @@ SIGNATURES = {
     "advise": "estimate part reach=None",
     "describe": "path",
     "estimate_from_surfaces": "surfaces grid=160",
-    "evaluate": "locate scenes report=None overwrite=False grid=160 seed=0 device='auto' "
+    "evaluate": "locate scenes folder=None overwrite=False grid=160 seed=0 device='auto' "
     "progress=None",
     "export": "case folder options",
     "find_organ": "content model=None range_mm=None box_mm=None mask=None picked_mm=None "
@@ -45,7 +45,7 @@ SIGNATURES = {
     "train_tissue_classifier": "frame picture organ beside",
     "track": "tracker source sinks=() until=None seconds=0.0 range_mm=None options",
     "train": "case folder preset='elastic' config=None rotations=None sensor=None minutes=None "
-    "steps=None seed=0 device='auto' workers=None checkpoint_every_s=30.0 report=None "
+    "steps=None seed=0 device='auto' workers=None checkpoint_every_s=30.0 on_status=None "
     "progress=None",
     "write_scenes": "case folder progress=None options",
 }

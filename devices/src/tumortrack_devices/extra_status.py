@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from tumortrack.core.estimate import Estimate
+from tumortrack.core.evidence import FREE
 from tumortrack.core.geometry import Points, transform_points
 from tumortrack.core.report import FAR_OFF, NextEvidence
 from tumortrack.live.values import TrackingResult
@@ -48,7 +49,7 @@ class ExtraStatus:
         """To what is known by now."""
         estimate, pose = result.estimate, result.published_frame.published_from_camera
         told = () if estimate is None else estimate.report.evidence
-        used = [p for e in told if not e.rejected and e.name != "free" for p in e.places_mm]
+        used = [p for e in told if not e.rejected and e.name != FREE for p in e.places_mm]
         self.known_mm = transform_points(pose, np.reshape(used, (-1, 3)))
         out = [place for each in told if each.rejected for place in each.places_mm]
         self._left_out.append((result.stamp_ns, transform_points(pose, np.reshape(out, (-1, 3)))))

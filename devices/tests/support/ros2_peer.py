@@ -118,7 +118,7 @@ def hear(seconds: float) -> None:
     reliable, volatile = Policy.Reliability.Reliable(0), Policy.Durability.Volatile
     topic = Topic(member := DomainParticipant(domain_id()), "rt/tumortrack/cloud", idl_type(CLOUD))
     _held = DataReader(member, topic, Qos(reliable, volatile, Policy.History.KeepLast(1)))
-    out = ResultMessages(messages, small_setting()).of(empty_update())
+    out = ResultMessages(messages, small_setting()).messages(empty_update())
     kinds = {sent.suffix: sent.message_type for sent in out if not sent.suffix.startswith("/")}
     heard = {name: bus.subscriber(f"/tumortrack/{name}", kind) for name, kind in kinds.items()}
     print(json.dumps({"listens": sorted(heard)}), flush=True)

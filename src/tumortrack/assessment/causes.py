@@ -83,7 +83,7 @@ def explained(
 def causes_of(
     model: Model, views: Sequence[View], estimate: Estimate | None, known: TrackedEvidence
 ) -> tuple[Likely, ...]:
-    """With those that looks, evidence and frames before tell; None: there is no estimate."""
+    """With those that views, evidence and frames before tell; None: there is no estimate."""
     check = check_of(estimate)
     if len(views) > 1 and check in _OF_POSES:
         return (Likely(Cause.POSES),)

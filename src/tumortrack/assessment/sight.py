@@ -26,7 +26,7 @@ _SEEN_WITHIN_MM = 6.0  # of a point, or twice the points' usual distance
 
 
 class Sight(NamedTuple):
-    """Shares of the organ's image, of all looks the worst: ``through`` which something is seen;
+    """Shares of the organ's image, of all views the worst: ``through`` which something is seen;
     ``by_depth``: in depth images; ``rim``: of its rim in which the surroundings are seen; not
     hidden (``in_sight``; None: no depth image); without points of a cloud (``unseen``; None: there
     is no cloud)."""

@@ -22,6 +22,7 @@ from tumortrack.assessment.sight import Sight, sight_of
 from tumortrack.core.assessment import Assessment, ErrorBound, deciding
 from tumortrack.core.errors import NotThisOrgan
 from tumortrack.core.estimate import Estimate
+from tumortrack.core.evidence import MOMENTARY
 from tumortrack.core.report import (
     EvidenceReport,
     Finding,
@@ -60,7 +61,6 @@ _FEW, _MANY, _FOR_EACH = 3, 8, 5
 _MAX_UNSEEN = 0.1  # share of the organ's image without points of a cloud
 _OUTVOTED = 3  # later pieces at that place that agree with the answer, and so with each other
 _THERE_MM = 15.0  # from what the answer has there: how far apart touches of one spot may lie
-_OF_A_MOMENT = "grasp", "free_space"  # they say it again in each frame, as long as it is so
 Advise = Literal["all", "touches", "nothing"]
 
 
@@ -81,7 +81,7 @@ def judged(
     from several views.
 
     Args:
-        looks: at the organ; of each share, the worst counts.
+        views: of the organ; of each share, the worst counts.
         strictly: the fit must be no worse than usual, whatever the camera sees round the organ.
         factor: by which the bounds are multiplied.
         last: of the frame before; a doubt about it may last.
@@ -302,7 +302,7 @@ class Disputes:
 
     def update(self, estimate: Estimate) -> Finding | None:
         """With the next answer: what still speaks against it."""
-        lasting = [e for e in estimate.report.evidence if e.name not in _OF_A_MOMENT]
+        lasting = [e for e in estimate.report.evidence if e.name not in MOMENTARY]
         new = [each for each in lasting if not each.before]
         for dispute in self._open:
             there_mm = _surface(estimate, dispute.part)[dispute.vertex]

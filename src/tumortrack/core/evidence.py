@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias, get_args
 
 import msgspec
 import numpy as np
@@ -28,6 +28,8 @@ class _Evidence(Config, frozen=True, kw_only=True, tag_field="kind"):
     ``shared_std_mm``: of a shift of all places of one ``tool``, as a hand-eye calibration errs, or
     without its name of this piece; 0: it is not shifted. ``stamp_ns``: when; 0: at the time of the
     cloud."""
+
+    lasting: ClassVar[bool] = True  # it holds in later frames too, as the tissue goes
 
     std_mm: float
     shared_std_mm: float = 0.0
@@ -103,6 +105,7 @@ class Grasp(_Evidence, frozen=True, kw_only=True, tag="grasp"):
     of which point it is, as the estimate had it when the tool took it. If both are known through
     one calibration, its error cancels: state no ``shared_std_mm``."""
 
+    lasting: ClassVar[bool] = False
     point_ct: Point
     place_mm: Point
     point_std_mm: float = 1.0
@@ -120,12 +123,16 @@ class Outline(_Evidence, frozen=True, kw_only=True, tag="outline"):
 class FreeSpace(_Evidence, frozen=True, kw_only=True, tag="free_space"):
     """Places without tissue, as along the shaft of a tool, which has the radius ``tip_mm``."""
 
+    lasting: ClassVar[bool] = False
     places_mm: tuple[Point, ...]
     tip_mm: float = 0.0
     std_mm: float = 1.0
 
 
 Evidence: TypeAlias = Touch | Landmark | Grasp | Outline | FreeSpace
+FREE = str(FreeSpace.__struct_config__.tag)
+# Names of kinds that are said again in each frame, as long as they are so.
+MOMENTARY = {str(kind.__struct_config__.tag) for kind in get_args(Evidence) if not kind.lasting}
 
 
 def _tuples(places: np.ndarray) -> Any:

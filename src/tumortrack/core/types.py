@@ -286,7 +286,8 @@ class SensorCloud:
 @dataclass(frozen=True, eq=False)
 class View(Renamed):
     """The organ seen by another camera or from another place: its points, ``cloud``, and all that
-    was ``seen``, in that camera's frame; ``camera_from_view`` leads to the first camera's."""
+    it saw (``full_view``), in that camera's frame; ``camera_from_view`` leads to the first
+    camera's."""
 
     cloud: SensorCloud
     full_view: DepthFrame | SensorCloud

@@ -232,6 +232,8 @@ class Loop:
                 estimate = estimate.reporting(cameras=tuple(view.number for view, _ in found))
             finding, warning = self._confirmed(estimate, doubt)
             quality = "good" if finding is None else "poor"
+            if finding is not estimate.finding:  # what holds in this frame holds for its estimate
+                estimate = estimate.assessed(finding=finding)
             if live_clock and _age_s(capture_ns) > stale_s:
                 raise NoEstimate(Finding("too_late", {"seconds": _age_s(capture_ns)}))
         except Exception as error:

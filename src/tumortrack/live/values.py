@@ -202,11 +202,12 @@ class TrackingResult(Renamed):
     """The loop's result for one frame: an estimate, or the reason why there is none.
 
     Attributes:
-        sequence: number of the result, from 0.
+        sequence: number of the result, from 0; a sink that gets only the newest (``queue_size`` 1)
+            sees the last one again, with no estimate, once the loop has said nothing for 2 s.
         stamp_ns: of the frame; without one, the present time on the source's clock.
         estimate: camera frame, mm; None if there is none. Never an older one.
         reason: why there is no estimate; empty with one.
-        quality: ``poor``: do not rely on it; ``warning`` says why.
+        quality: the verdict. ``poor``: do not rely on it; ``warning`` says why.
         observation: what the source saw; of several cameras, the one in whose frame the estimate
             is. None without a frame, or if the camera's pose is unknown.
         organ: the points that belong to the organ; camera frame.
@@ -244,7 +245,8 @@ class TrackingResult(Renamed):
 
     @cached_property
     def transformed(self) -> TransformedEstimate | None:
-        """The estimate in the published frame: what sinks send."""
+        """Surfaces and points in the published frame. Centres: ``center_mm``, as the box of a
+        turned surface has another middle."""
         if self.estimate is None:
             return None
         pose, cloud = self.published_frame.published_from_camera, self.estimate.cloud
@@ -260,7 +262,8 @@ class TrackingResult(Renamed):
 
     @property
     def bounds(self) -> Mapping[str, ErrorBound]:
-        """How far off each part is at most; of a good answer, as far as it is known."""
+        """How far off each part is at most (``bounds[part].error_bound95_mm``); of a good answer,
+        as far as it is known: a part may be missing."""
         if self.estimate is None or self.quality != "good":
             return {}
         return self.estimate.assessment.bounds
@@ -390,7 +393,8 @@ class Controls:
 
 @dataclass(frozen=True, eq=False)
 class SinkContext(Renamed):
-    """What a sink knows when it is opened. ``parts``: of the model, the organ first.
+    """What a sink knows when it is opened. ``parts``: of the model, the organ first, then the
+    tumors; ``published_frame``: its name may change with the first frame, see each result's.
     ``anatomy_ct``: the organ in the CT (LPS, mm), if the model has it: estimates then have a
     motion, and their meshes its triangles. ``controller``: acts on results, which then have its
     state. ``patient``: of the model. ``cameras``: poses of several fixed cameras, published frame.

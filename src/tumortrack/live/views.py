@@ -30,7 +30,7 @@ from tumortrack.tracking.tracker import Tracker
 _NOISE_S = 1.0  # a camera's noise is measured so often: as long as a frame's other work takes
 _PICK_S = 3.0  # without the organ: a pick is forgotten
 
-SCAN_LOOKS, SCAN_WITHIN_S = 3, 5.0
+SCAN_VIEWS, SCAN_WITHIN_S = 3, 5.0
 # A view sees the organ's shift along its own line of sight, within a millimetre or so. What the
 # others leave open sideways is half along the line of a view from 30 degrees aside.
 SCAN_APART_DEG = 30.0
@@ -278,8 +278,8 @@ class Scan:
         angles = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
         if angles.min(initial=180.0) >= SCAN_APART_DEG:
             self._views.append((view, organ))
-        if len(self._views) < SCAN_LOOKS:
-            values: dict[str, float | str] = {"views": len(self._views), "of": SCAN_LOOKS}
+        if len(self._views) < SCAN_VIEWS:
+            values: dict[str, float | str] = {"views": len(self._views), "of": SCAN_VIEWS}
             values |= {"degrees": SCAN_APART_DEG, "seconds": SCAN_WITHIN_S}
             raise NoEstimate(Finding("scan_waits", values))
         *others, (last, cloud) = self._views
@@ -288,7 +288,7 @@ class Scan:
         try:
             estimates = [
                 self._tracker.follow(cloud, full_view=last.seen.content, views=views[:n])
-                for n in range(SCAN_LOOKS)
+                for n in range(SCAN_VIEWS)
             ]
         except NoEstimate as error:
             raise NoEstimate(Finding("scan_failed", {"reason": str(error)})) from error
@@ -300,7 +300,7 @@ class Scan:
         steps = ", then ".join(f"{mm:.1f} mm" for mm in bounds_mm)
         self.summary = (
             f"scan: the least sure tumor was off by at most {steps} (95 %), with one to "
-            f"{SCAN_LOOKS} looks"
+            f"{SCAN_VIEWS} views"
         )
         return whole
 

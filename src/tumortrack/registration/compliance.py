@@ -129,9 +129,9 @@ def _precision_of_forces(near: Residuals, known: int, std_mm: float) -> Float64[
 
 @dataclass(frozen=True, eq=False)
 class Linear:
-    """A Gauss-Newton step's equations at a motion that has ``moved`` from where the prior has the
-    pose: of it, and of further cameras' errors; those that neighbours share, and those of tools,
-    are marginalised."""
+    """A Gauss-Newton step's equations at a motion that has ``pose_offset`` from where the prior has
+    the pose: of it, and of further cameras' errors; those that neighbours share, and those of
+    tools, are marginalised."""
 
     motion: ElasticMotion
     pose_offset: Float64[np.ndarray, " 6"]

@@ -288,7 +288,7 @@ def _evidence_of(
 def _fit_cost(
     fit: RegistrationResult, prior: PosePrior, usual_cost: float, config: GaussNewtonConfig
 ) -> FitCost:
-    """``usual_cost``: of one view, without its noise. Of several looks the one with most outliers
+    """``usual_cost``: of one view, without its noise. Of several views the one with most outliers
     counts."""
     views, outliers, now = fit.views, fit.outliers, fit.points_cost
     if views.count > 1:

@@ -278,7 +278,7 @@ def propagate(
     now. What lies on tissue moves with it, and is less sure the farther from where it came. What a
     tool holds, and where no tissue was, tell nothing but in their own frame; nor do the oldest of
     many."""
-    lasting = [each for each in known if not isinstance(each.piece, Grasp | FreeSpace)]
+    lasting = [each for each in known if each.piece.lasting]
     counts = np.cumsum([len(each.piece.places) for each in reversed(lasting)])
     lasting = lasting[len(lasting) - int((counts <= _MOST_KEPT).sum()) :]
     kept, pieces = list[TrackedEvidence](), list[Evidence]()

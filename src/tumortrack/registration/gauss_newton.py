@@ -78,10 +78,10 @@ _descend = kernel(
 
 @dataclass(frozen=True, eq=False)
 class RegistrationResult:
-    """A motion fitted to looks.
+    """A motion fitted to views.
 
     Attributes:
-        looks: with the places of further cameras as they are corrected for this motion.
+        views: with the places of further cameras as they are corrected for this motion.
         cost: robust data term, prior of the motion, and the further cameras' errors.
         outliers: share of the points farther off than ``FARTHEST`` widths;
             ``cost_without_strays``: if all lay as the others do.
@@ -89,7 +89,8 @@ class RegistrationResult:
         pose_offset: shift (mm) and turn (rad) from where the prior has the pose.
         terms: of the evidence, at the motion.
         alternatives: other minima that explain the points nearly as well; ``excluded_pose``: one
-            that explains them better, in a pose that is excluded (see ``registration.select_best``).
+            that explains them better, in a pose that is excluded (see
+            ``registration.select_best``).
     """
 
     motion: ElasticMotion
@@ -144,7 +145,8 @@ def refine(
 class GaussNewton:
     """A refinement that can be stopped on its way and continued. ``cost``: of the present state, as
     in ``RegistrationResult``; infinite before the first step. ``steps``: taken so far;
-    ``converged``: more would not move it. ``moved``: the start's, as in ``RegistrationResult``;
+    ``converged``: more would not move it. ``pose_offset``: the start's, as in
+    ``RegistrationResult``;
     None: the prior has the pose where it starts. ``state``: pose, coefficients and shift, and at
     them the distances, the curvature and the gradient of the cost."""
 

@@ -171,7 +171,7 @@ class RegistrationLocator:
     def _refined(self, fit: RegistrationResult, frame: Frame) -> RefinedFit:
         """In the body's compliance. Raises NotThisOrgan."""
         self._registration.check(fit, self._model.in_distribution)
-        with frame.stage("bend"):
+        with frame.stage("compliance"):
             return self._registration.refine_compliance(fit)
 
     def _smoothed(

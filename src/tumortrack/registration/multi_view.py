@@ -71,7 +71,7 @@ class MultiViewCloud:
         shifts: by how much the organ was found to lie elsewhere before each camera (mm, rad; its
             axes, about its centre): the camera's error, which points and places are rid of.
         evidence: what is known beside the points.
-        noise: of the points; where looks differ, that of the worst.
+        noise: of the points; where views differ, that of the worst.
         candidates_mm: points of a single view that may be the organ's too.
         depth_error: of the cameras, of the worst; None: of one of them nobody has stated it.
     """

@@ -5,13 +5,14 @@
    with a robust kernel; and again from starts beside the best fit, turned where its turn is least
    certain: one side leaves the turn about the organ's long axis nearly free, and there are local
    minima on the way.
-3. Correct (`looks`): where there are several cameras, their places and the motion in turns.
+3. Correct (`multi_view`): where there are several cameras, their places and the motion in turns.
 4. Choose (`select_best`, below): by cost, and by how the organ may lie, which the case says. Other
    minima that explain the points nearly as well, and put a tumor elsewhere, are kept as
    alternatives; one that explains them better in a pose that the case excludes makes the answer
    poor.
 5. Verdict (`registration.in_distribution`): what cannot be this organ is refused.
-6. Bend (`bend`): what the library's states cannot follow, the body's compliance does; with it, what
+6. Compliance (`compliance`): what the library's states cannot follow, the body's compliance does;
+with it, what
    points and evidence leave open.
 
 The result is a motion (`motion`): any point of the CT, carried to the camera's frame and back, with
@@ -93,7 +94,7 @@ class Registration:
         """The most likely fit to one or several looks at a still organ, wherever it lies.
 
         Args:
-            known: a fit of these looks, which is kept if it is best.
+            known: a fit of these views, which is kept if it is best.
             timed: times the stages ``search`` and ``refine``.
             again: there is no reason to doubt ``known``: see ``Search.starts``.
         """
@@ -109,7 +110,7 @@ class Registration:
     def with_all_points(
         self, fit: RegistrationResult, views: MultiViewCloud, rounds: int = _ROUNDS
     ) -> RegistrationResult:
-        """The fit, and its alternatives', to all points that lie on the organ: those of ``looks``
+        """The fit, and its alternatives', to all points that lie on the organ: those of ``views``
         and the candidates that the fit shows to be the organ's, too; until they stay the same."""
         near = msgspec.structs.replace(self.config, first_mm=self.config.last_mm)
         count = len(fit.views.points_mm)

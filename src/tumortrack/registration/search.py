@@ -63,8 +63,8 @@ _descend_rigidly = kernel(
 
 
 class Start(NamedTuple):
-    """Where a fit starts. ``moved``: shift (mm) and turn (rad) from where the prior has the pose;
-    None: it has it here."""
+    """Where a fit starts. ``pose_offset``: shift (mm) and turn (rad) from where the prior has the
+    pose; None: it has it here."""
 
     motion: ElasticMotion
     pose_offset: Float64[np.ndarray, " 6"] | None = None
@@ -249,7 +249,7 @@ def far_from(motion: ElasticMotion, others: Iterable[ElasticMotion]) -> bool:
 
 def turned_starts(fitted: ElasticMotion, pose_offset: Float64[np.ndarray, " 6"]) -> list[Start]:
     """Turned both ways about each principal axis of the turn's covariance; shift and coefficients
-    follow as they are correlated with the turn. ``moved``: as in ``Start``, of the fit."""
+    follow as they are correlated with the turn. ``pose_offset``: as in ``Start``, of the fit."""
     covariance = fitted.covariance
     assert covariance is not None
     variances, axes = np.linalg.eigh(covariance[3:6, 3:6])

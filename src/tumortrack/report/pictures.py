@@ -225,7 +225,7 @@ def _section(
 def depth_picture(
     frame: DepthFrame, pixel_class: UInt8[np.ndarray, "h w"] | None = None
 ) -> Image.Image:
-    """Near is bright, no return is black; what was ``taken`` for the organ has its colour."""
+    """Near is bright, no return is black; what was taken for the organ has its colour."""
     depth_mm = frame.depth_mm if pixel_class is None else frame.depth_mm[sampled_pixels(frame)]
     (height, width), known = depth_mm.shape, np.isfinite(depth_mm)
     grey = np.zeros((height, width))

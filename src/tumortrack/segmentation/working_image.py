@@ -115,11 +115,11 @@ class RegionConfig(Config, frozen=True, kw_only=True):
 class WorkingImage:
     """A depth image at working size, and the state of its pixels.
 
-    ``depth_mm`` (h, w) is float32, NaN without a return; ``taken`` (h, w), uint8, holds the states
-    above, which the steps write. Each of its pixels is one of ``step_px`` by ``step_px`` of the
-    frame's, averaged over ``window_px`` to either side. ``remaining(taken)``: indices (n,) of the
-    frame's or cloud's points that are still ORGAN; ``points(indices)``: these (n, 3), camera frame,
-    mm.
+    ``depth_mm`` (h, w) is float32, NaN without a return; ``pixel_class`` (h, w), uint8, holds the
+    states above, which the steps write. Each of its pixels is one of ``step_px`` by ``step_px`` of
+    the frame's, averaged over ``window_px`` to either side. ``remaining(taken)``: indices (n,) of
+    the frame's or cloud's points that are still ORGAN; ``points(indices)``: these (n, 3), camera
+    frame, mm.
     """
 
     depth_mm: np.ndarray
@@ -154,7 +154,7 @@ class WorkingImage:
 
     def cropped(self) -> tuple[tuple[slice, slice], WorkingImage]:
         """The rows and columns of the remaining pixels, with one more to each side, and a copy of
-        that part; its ``taken`` must be written back."""
+        that part; its ``pixel_class`` must be written back."""
         rows = columns = slice(0, 1)
         organ = self.pixel_class == ORGAN
         if organ.any():

@@ -86,9 +86,9 @@ class Tracker:
         Args:
             points: of the organ, as the camera sees them: n x 3, camera frame, mm.
             views: of further cameras, or from other places, while the organ rests.
-            evidence: what else is known of where it lies then: ``Touch``, ``Landmark``, ``Held``,
-                ``Outline``, ``Free``, in the frame of ``points``. There may be no points: then it
-                has twelve places or more, touched or outlined.
+            evidence: what else is known of where it lies then: ``Touch``, ``Landmark``, ``Grasp``,
+                ``Outline``, ``FreeSpace``, in the frame of ``points``. There may be no points: then
+                it has twelve places or more, touched or outlined.
             full_view: all that the camera saw, by which the estimate is judged; default:
             ``points``.
             grid: voxels along the longest side of the labelled volume.
@@ -106,7 +106,7 @@ class Tracker:
         check_seed(seed)
         cloud = cloud_of(points)
         all_views: Sequence[View]
-        all_views, pieces = _looks_of(cloud, full_view, views), _evidence_of(evidence)
+        all_views, pieces = _views_of(cloud, full_view, views), _evidence_of(evidence)
         if frame != CAMERA:
             return replace(self._located_in_frame(cloud, pieces, grid, seed), frame=frame)
         return self._located(cloud, all_views, pieces, grid, seed)
@@ -165,7 +165,7 @@ class Tracker:
         # A fit that is suddenly worse may be to another object.
         strictly = how.allow_flip if last is None else last.quality != "good" or not _unusual(last)
         all_views: Sequence[View]
-        all_views, pieces = _looks_of(cloud, full_view, views), _evidence_of(evidence)
+        all_views, pieces = _views_of(cloud, full_view, views), _evidence_of(evidence)
         if pieces:
             how = msgspec.structs.replace(how, evidence=(*how.evidence, *pieces))
 
@@ -174,9 +174,7 @@ class Tracker:
             return judged(found, all_views, strictly, self.model.bound_factor, last)
 
         with self._explaining_errors(all_views, how, bool(pieces or (last and last.evidence))):
-            estimate, all_views = select_piece(
-                all_views, located, most=1
-            )  # a frame may not wait
+            estimate, all_views = select_piece(all_views, located, most=1)  # a frame may not wait
         advise: Advise = "touches" if how.global_search else "nothing"
         return assessed(estimate, all_views, self.model, how.known, advise, self._advised)
 
@@ -278,17 +276,19 @@ def cloud_of(points: SensorCloud | Float[np.ndarray, "n 3"]) -> SensorCloud:
     return SensorCloud(points)
 
 
-def _looks_of(
+def _views_of(
     cloud: SensorCloud, full_view: DepthFrame | SensorCloud | None, views: Sequence[View]
 ) -> tuple[View, ...]:
     """The cloud's view, then the others."""
-    hint = "views=[View(cloud, seen, camera_from_view)]; touches and the like are evidence=[...]"
+    hint = (
+        "views=[View(cloud, full_view, camera_from_view)]; touches and the like are evidence=[...]"
+    )
     others = _all_of(View, views, "views are of View", hint)
     return tuple(map(_cleaned, (View(cloud, full_view or cloud, IDENTITY), *others)))
 
 
 def _evidence_of(evidence: Sequence[Evidence]) -> tuple[Evidence, ...]:
-    kinds = "evidence is of Touch, Landmark, Held, Outline and Free"
+    kinds = "evidence is of Touch, Landmark, Grasp, Outline and FreeSpace"
     hint = "evidence=[Touch(place_mm=(x, y, z))]; further cameras' views are views=[...]"
     return _all_of(Evidence, evidence, kinds, hint)
 

@@ -179,10 +179,10 @@ class TipTool(Tool):
         self._waiting, given = fresh, [piece for _, piece in fresh]
         if self._on and self._point and (tip_mm := self._tip(now_ns)) is not None:
             given.append(Piece(Grasp, tip_mm[:1], self._point))
-            self.counts["held"] += 1
+            self.counts["grasp"] += 1
         if self.config.shaft_mm and (shaft_mm := self._tip(now_ns)) is not None:
             given.append(Piece(FreeSpace, shaft_mm[1:], {"tip_mm": self.config.tip_mm}))
-            self.counts["free"] += 1
+            self.counts["free_space"] += 1
         return given
 
     def _seen_by(self, view: CameraView, piece: Piece) -> Evidence:
