@@ -27,7 +27,7 @@ from tumortrack_benchmarks.document import (
 )
 
 ROOT = Path(__file__).parents[2]
-NAMES = "bounds", "demo", "evidence", "noise", "population", "pull", "rehearsal", "soak", "world"
+NAMES = "bounds", "demo", "evidence", "noise", "population", "pull", "rehearsal", "soak", "stress"
 
 
 def test_rows_are_measured_once_for_all_that_decides_them(tmp_path):

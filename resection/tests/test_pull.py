@@ -195,7 +195,7 @@ def test_a_grip_that_slips_halts_the_arms():
     for quality in ("good", "poor"):  # whatever else is thought of it
         cell = procedure.frame(seen(quality, evidence=slipped))
         assert (cell.halt.kind, cell.halt.values["off_mm"]) == ("slipped", 11.6)
-    assert procedure.frame(seen(evidence=[{**slipped[0], "left_out": False}])).halt is None
+    assert procedure.frame(seen(evidence=[{**slipped[0], "rejected": False}])).halt is None
 
 
 @pytest.fixture(scope="module")

@@ -32,8 +32,13 @@ def test_what_an_editor_offers_is_what_the_function_takes(typed, options):
 
 @pytest.mark.parametrize(
     ("call", "known"),
-    [(tt.prepare, "series"), (tt.write_scenes, "seed"), (tt.export, "series"), (tt.locate, "seed")],
-)
+    [
+        (tt.prepare, "series"),
+        (tt.write_scenes, "seed"),
+        (tt.export, "series"),
+        (tt.locate_files, "seed"),
+    ],
+)  # fmt: skip
 def test_an_unknown_keyword_is_named_with_the_known_ones(call, known, tmp_path):
     with refused(tt.errors.InputError, "'gird'", known):
         call(tmp_path, tmp_path / "out", gird=3)

@@ -94,7 +94,7 @@ def test_an_unreadable_input_is_named_and_no_folder_stays(tmp_path):
     source = tmp_path / "ball.nii"
     source.symlink_to(source)
     with refused(InputError, "ball.nii"):
-        Prepare(input=source, case=tmp_path / "new" / "dir" / "case").run()
+        Prepare(input=source, out=tmp_path / "new" / "dir" / "case").run()
     assert list(tmp_path.iterdir()) == [source]
 
 

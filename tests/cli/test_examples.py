@@ -63,7 +63,7 @@ def test_touches_bring_a_hidden_half_nearer(story):
     gains = re.findall(r"next, .+: tumor_\d .+ ([\d.]+) mm instead of ([\d.]+)", said["08"])
     assert len(gains) >= 8  # twice three touches, an outline, a view
     assert all(float(then) <= float(now) for then, now in gains)
-    assert said["08"].count("of it information_gain") == 6
+    assert said["08"].count("of it new") == 6
 
 
 def test_the_scene_is_deformed_and_pictured(story):

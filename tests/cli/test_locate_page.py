@@ -223,9 +223,9 @@ def test_the_page_shows_evidence_and_what_to_learn_next_where_the_organ_surely_l
             "tool": "probe",
             "off_mm": 0.44,
             "information_gain": 0.312,
-            "left_out": False,
+            "rejected": False,
         },
-        {"name": "outline", "off_mm": 24.0, "information_gain": 0.0, "left_out": True},
+        {"name": "outline", "off_mm": 24.0, "information_gain": 0.0, "rejected": True},
     ]
     known = [{**each, "places_mm": [[30.0, 20.0, 110.0 + n]]} for n, each in enumerate(known)]
     advice = [
@@ -237,8 +237,8 @@ def test_the_page_shows_evidence_and_what_to_learn_next_where_the_organ_surely_l
         for kind, bound_mm, then_mm in foreseen
     ]  # fmt: skip
     estimate = advised(reporting(small_estimate(), evidence=known), advice)
-    baseline = Finding("baseline", {"part": "tumor_1", "distance_mm": 9.0})
-    estimate = estimate.assessed(finding=None if placed else baseline)
+    elsewhere = Finding("alternative", {"part": "tumor_1", "distance_mm": 9.0})
+    estimate = estimate.assessed(finding=None if placed else elsewhere)
     write_run_page(tmp_path, {}, estimate, Seen())
     page = (tmp_path / PAGE).read_text()
     for cell in (">touch 1</th>", ">0.4 mm</td>", ">31 %</td>", ">outline 2</th>", ">24.0 mm</td>"):

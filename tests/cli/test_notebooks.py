@@ -79,4 +79,4 @@ def test_touches_make_a_hidden_half_surer_and_a_wrong_one_is_named(ran):
     assert (off_mm > 0).any()
     assert (bounds_mm[:, 2] < bounds_mm[:, 0]).all()
     assert "touch 7" in said
-    assert said.count("left out\n") == 1
+    assert said.count("rejected\n") == 1

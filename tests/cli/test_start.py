@@ -33,7 +33,6 @@ def cloud(tmp_path, phantom_case):
         ("locate CLOUD MODEL --out OUT", "tumortrack locate MODEL CLOUD --out OUT"),
         ("locate MODEL CASE --out OUT", "CASE"),
         ("locate MODEL CLOUD", "--out"),
-        ("locate MODEL NONE.ply OUT", "NONE.ply"),  # as it was once
         ("evaluate MODEL NONE OUT", "NONE"),
         ("train NONE OUT", "NONE"),
     ],

@@ -303,4 +303,4 @@ def test_python_takes_the_commands_options(slim_model, cloud, tmp_path):
         ([cloud], {"intrinsics": ["a.json", "b.json"]}, "2 times"),
     ):
         with refused(InputError, named):
-            tt.locate(str(slim_model), cloud_of, **options)
+            tt.locate_files(str(slim_model), cloud_of, **options)

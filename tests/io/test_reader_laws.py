@@ -26,6 +26,7 @@ from tumortrack.core.config import findings_in
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import RAS_FROM_LPS, transform_points
 from tumortrack.core.types import LabelVolume, Volume
+from tumortrack.core.wording import for_caller
 from tumortrack.io.case import load_case, save_case
 from tumortrack.io.mesh_files import write_mesh
 from tumortrack.io.segmentation_files import segments, write_dicom_seg
@@ -433,7 +434,8 @@ def test_our_own_dicom_segmentation_is_read_as_it_was_written(phantom, tmp_path)
     assert np.array_equal(raw.array, labels[..., first:stop])
     assert not labels[..., stop:].any()
     assert not case.warnings
-    assert raw.notes[0] in case.report["notes"]  # where the CT ends, the file does not say
+    where_it_ends = for_caller(raw.notes[0])  # the file does not say
+    assert where_it_ends in case.report["notes"]
 
 
 def test_a_dicom_segmentation_is_cut_where_its_ct_ends(phantom, tmp_path):

@@ -21,10 +21,10 @@ TESTS = (
     "tests/core/test_render.py",
     "tests/core/test_sense_kernels.py",
     "tests/report/test_renderer_kernels.py",
-    "tests/registration/test_bend.py",
+    "tests/registration/test_compliance.py",
     "occupancy/tests/test_lattice_kernels.py",
     "benchmarks/tests/test_cut.py::test_voxels_near_electrodes_learn_how_far_these_are",
-    "benchmarks/tests/test_world.py::test_the_bed_is_a_cubic_spline_of_its_grid_with_its_slope",
+    "benchmarks/tests/test_stress.py::test_the_bed_is_a_cubic_spline_of_its_grid_with_its_slope",
 )
 
 

@@ -287,7 +287,7 @@ def test_a_scan_takes_three_looks_from_apart_and_says_what_each_added(tracker):
     def ask(scan, *view):
         """An answer, or the number of views so far; -1: it was begun anew."""
         try:
-            return scan.view_of(*seen(*view))
+            return scan.take(*seen(*view))
         except NoEstimate as error:
             values = error.finding.values
             return values.get("views", -1) if error.finding.kind == "scan_waits" else -1
@@ -310,9 +310,9 @@ def test_a_scan_takes_three_looks_from_apart_and_says_what_each_added(tracker):
     assert "follow" in follower.locate(seen(50, 12.0)[1]).report.timings
     views = ViewsLocator(follower, small_setting(), RegionConfig(), 1.0, 0)
     views.scan = Scan(tracker)
-    for view in ((-50, 7.5), (0, 8.0)):
+    for degrees, stamp_s in ((-50, 7.5), (0, 8.0)):
         with pytest.raises(NoEstimate):
-            views.locate([seen(*view)])
+            views.locate([seen(degrees, stamp_s)])
     views.locate([seen(50, 9.0)])
     assert views.scanned == scan.summary  # what the live page shows from then on
     turned, scan = nudged(REST, [12.0, 0, 0], [0, 0, 0.3]), Scan(tracker)
