@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from imaging_objects import OBLIQUE
 from refused import refused
 from tumortrack.case.meshes import is_simple, label_meshes, read_meshes
 from tumortrack.core.errors import InputError
@@ -157,3 +158,22 @@ def test_labels_of_meshes_have_their_volumes(tmp_path):
     assert counts[1:].sum() == pytest.approx(anatomy.organ.volume_mm3, rel=0.01)
     centre = labels.lps_from_index @ [*np.argwhere(labels.labels == 2).mean(0), 1]
     assert centre[:3] == pytest.approx([32, -17, 38], abs=0.1)
+
+
+def test_winding_numbers_agree_with_an_independent_test():
+    mesh = trimesh.Trimesh(ORGAN.vertices @ OBLIQUE.T, ORGAN.faces, process=False)
+    ours = Mesh(mesh.vertices, mesh.faces)
+    frame_from_index, shape = np.diag([2.7, 2.7, 2.7, 1.0]), (24, 26, 40)
+    frame_from_index[:3, 3] = mesh.bounds[0] - 3
+    numbers = winding_numbers(ours, frame_from_index, shape)
+    centres = np.argwhere(np.ones(shape, bool)) * 2.7 + frame_from_index[:3, 3]
+    assert np.array_equal(numbers.ravel() == 1, mesh.contains(centres))
+    assert set(np.unique(numbers)) == {0, 1}
+    mirror = frame_from_index @ np.diag([-1.0, 1, 1, 1])
+    mirror[:3, 3] += frame_from_index[:3, 0] * (shape[0] - 1)
+    assert np.array_equal(winding_numbers(ours, mirror, shape)[::-1], numbers)
+    inside_out = winding_numbers(Mesh(mesh.vertices, mesh.faces[:, ::-1]), mirror, shape)
+    assert np.array_equal(-inside_out[::-1], numbers)
+    assert is_simple(ours, 1.0)
+    crossing = trimesh.util.concatenate([mesh, trimesh.creation.box((30, 30, 30), np.eye(4))])
+    assert not is_simple(Mesh(crossing.vertices, crossing.faces), 1.0)

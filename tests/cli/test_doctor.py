@@ -3,12 +3,16 @@
 import os
 import re
 import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 
 from extension_objects import distribution
-from tumortrack.cli.doctor import Doctor, part
+from tumortrack.cli.doctor import PURPOSES, Doctor, part
 from tumortrack.cli.main import run
+
+ROOT = Path(__file__).parents[2]
 
 
 def test_it_finds_everything_on_one_screen_also_where_the_system_tells_no_affinity(
@@ -82,3 +86,12 @@ def test_what_is_installed_and_does_not_work_is_told_by_the_exit_status(breaking
     assert run(["doctor"]) == 1
     (line,) = [x for x in capsys.readouterr().out.splitlines() if "PyObject_Vast" in x]
     assert line.startswith("BROKEN ")
+
+
+@pytest.mark.parametrize("folder", [".", "devices", "occupancy", "experiment", "benchmarks"])
+def test_it_knows_what_every_extra_is_for(folder):
+    project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text())["project"]
+    needs = project.get("optional-dependencies", {})
+    other = {name for name, (first, *_) in needs.items() if first.startswith("tumortrack-")}
+    extras = {*needs, ""} - {"dev", "docs"} - other  # these are told as distributions
+    assert {extra for name, extra in PURPOSES if name == project["name"]} == extras

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import sysconfig
+import tomllib
 import venv
 import zipfile
 from importlib.metadata import version
@@ -97,3 +98,15 @@ def test_the_wheel_holds_the_package_alone(wheel):
     assert scenes == "tumortrack/simulation/phantom_scenes.safetensors"
     assert zipfile.ZipFile(wheel).getinfo(scenes).compress_size < 5_000_000
     assert any(name.endswith("LICENSE") for name in names)
+
+
+@pytest.mark.parametrize(
+    "folder", [".", "devices", "occupancy", "resection", "experiment", "benchmarks"]
+)
+def test_a_description_holds_on_pypi_where_links_into_the_repository_lead_nowhere(folder):
+    project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text())["project"]
+    text = (ROOT / folder / project["readme"]).read_text()
+    assert re.findall(r"\]\((?!https://)", text) == []
+    for extra in re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE):
+        assert extra in project["optional-dependencies"]
+    assert (ROOT / folder / "LICENSE").read_bytes() == (ROOT / "LICENSE").read_bytes()

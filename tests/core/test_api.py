@@ -2,6 +2,8 @@
 
 import inspect
 import shutil
+import subprocess
+import sys
 from dataclasses import FrozenInstanceError
 from html import escape
 from pathlib import Path
@@ -254,3 +256,9 @@ def test_scenes_are_not_written_among_other_files(phantom_case, tmp_path):
     with refused(tt.errors.InputError, "thesis.txt"):
         tt.write_scenes(phantom_case, tmp_path, scenes=1)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+def test_importing_the_package_loads_nothing_heavy():
+    code = "import sys, tumortrack; dir(tumortrack); print(*sys.modules)"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"torch", "numpy", "scipy"} & set(said.stdout.split())

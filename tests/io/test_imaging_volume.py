@@ -264,3 +264,27 @@ def test_a_multi_frame_object_beside_a_series_is_left_out_with_a_note(tmp_path):
         path.unlink()
     with pytest.raises(InputError):  # two frames at one place
         read_raw(tmp_path)
+
+
+SHEARED = np.eye(4) + np.eye(4, k=1) * [0, 0.2, 0.1, 12.0]
+
+
+@pytest.mark.parametrize("number", [np.uint8, np.int16, np.float32, np.float64])
+@pytest.mark.parametrize("affine", [*GRIDS.values(), SHEARED], ids=[*GRIDS, "sheared"])
+def test_a_written_header_is_what_nibabel_reads_and_would_write(tmp_path, affine, number):
+    array = blob_array(affine, SHAPE).astype(number)
+    nifti.write_nifti(tmp_path / "v.nii", array, affine, lps=False)
+    found = nibabel.load(tmp_path / "v.nii")
+    assert np.array_equal(np.asarray(found.dataobj), array)
+    assert found.get_data_dtype() == number
+    theirs = nibabel.Nifti1Image(array, affine)
+    theirs.header.set_xyzt_units("mm")
+    theirs.set_sform(affine, code="scanner")
+    theirs.set_qform(affine, code=int(found.header["qform_code"]))
+    fields = ["dim", "bitpix", "xyzt_units", "sform_code", "srow_x", "srow_y", "srow_z"]
+    quaternion = ["quatern_b", "quatern_c", "quatern_d", "qoffset_x", "qoffset_y", "qoffset_z"]
+    orthogonal = affine is not SHEARED  # only such a grid has a quaternion
+    assert (found.header["qform_code"] == 1) == orthogonal
+    for field in fields + quaternion * orthogonal:
+        np.testing.assert_allclose(found.header[field], theirs.header[field], atol=2e-6)
+    np.testing.assert_allclose(found.header["pixdim"][:4], theirs.header["pixdim"][:4], rtol=1e-6)

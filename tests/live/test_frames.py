@@ -380,3 +380,26 @@ def test_a_source_that_stays_away_ends_the_loop_and_stop_ends_it_from_elsewhere(
 def test_limits_of_the_loop_are_checked(wrong):
     with pytest.raises(InputError):
         LoopConfig(**wrong)
+
+
+def test_a_lost_source_comes_back(clock):
+    tapes = [Tape(0, 40, SourceLost("unplugged"), on_demand=False), Tape(80, 120, on_demand=False)]
+    said, told = threading.Event(), []
+
+    def plug_in():
+        if len(tapes) == 1:  # however slow the machine: not before the loop has said why
+            assert said.wait(PATIENCE_S)
+        return tapes.pop(0)
+
+    def listen(result):
+        told.append(result)
+        if result.reason == "unplugged":
+            said.set()
+
+    loop = Loop(Located(), small_setting(), LoopConfig(region=ALL, stale_s=0.1))
+    reader = SourceWorker(plug_in, again_s=0.0)
+    loop.run(reader, [], listen)
+    reader.close()
+    assert sum(found(told)) == 4
+    assert reader.opened == 2
+    assert found(told)[:2] == found(told)[-2:] == [True, True]

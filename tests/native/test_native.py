@@ -97,3 +97,8 @@ def test_a_compiler_that_is_not_there_ends_the_build_in_one_line():
     assert "no-such-compiler" in said.stderr.splitlines()[0]
     assert len(said.stderr.splitlines()) == 1
     assert build("--compiler", CC="some cc").stdout == "some cc\n"
+
+
+def test_pip_and_make_build_with_the_same_ziglang():
+    locked = (ROOT / "requirements" / "compiler.txt").read_text().split()[0]
+    assert f'"{locked}"' in (ROOT / "tools" / "build_backend.py").read_text()

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from elastic_objects import CENTER, RADII, SMALL
@@ -16,6 +17,7 @@ from tumortrack.core.estimate import Motion
 from tumortrack.core.types import Mesh
 from tumortrack.organ.rest_shape import RestShape, distance_of
 from tumortrack.registration.config import GaussNewtonConfig
+from tumortrack.registration.gauss_newton import prior_precision
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.multi_view import MultiViewCloud
 from tumortrack.registration.search import turned_starts
@@ -242,3 +244,33 @@ def test_starts_beside_a_fit_are_as_unlikely_as_was_asked_and_lead_back_to_it():
     turns = np.array(turns)
     np.testing.assert_allclose(turns[::2], -turns[1::2], atol=1e-9)
     assert np.linalg.matrix_rank(turns, tol=1e-3) == 3
+
+
+def test_a_slow_general_optimiser_finds_the_same():
+    config = GaussNewtonConfig(steps=60, enough_mm=1e-4)
+    points = surface(placed(), 150) + np.random.default_rng(8).normal(0, 0.5, (150, 3))
+    fit = refined(points, START, config)
+    root = np.linalg.cholesky(prior_precision(shape(), config)).T
+    weight = min(config.n_effective / len(points), 1.0) / config.sigma_mm**2
+
+    def moved(x):
+        turn = Rotation.from_rotvec(x[3:6]).as_matrix()
+        centre = START.centre_mm + START.rotation @ x[:3]
+        return START.rotation @ turn, centre, x[6:]
+
+    def residuals(x):
+        distance = ElasticMotion(shape(), *moved(x)).residual_rows(points)[:, -1].astype(float)
+        robust = np.sqrt(weight) * distance / np.sqrt(1 + (distance / config.last_mm) ** 2)
+        off = np.concatenate([x[:6], x[6:] - shape().body.mean])
+        return np.concatenate([robust, root @ off])
+
+    truth = placed()  # from START it ends far away: nothing widens its kernel
+    turn = Rotation.from_matrix(START.rotation.T @ truth.rotation).as_rotvec()
+    shift = START.rotation.T @ (truth.centre_mm - START.centre_mm)
+    begin = np.concatenate([shift, turn, truth.coefficients])
+    scale = np.concatenate([np.ones(3), np.full(3, 0.02), np.ones(20)])
+    found = least_squares(residuals, begin, diff_step=1e-2, x_scale=scale)
+    slow = ElasticMotion(shape(), *moved(found.x))
+    assert fit.cost == pytest.approx(2 * found.cost, rel=0.02)
+    away = fit.motion.forward(inside(200)) - slow.forward(inside(200))
+    assert np.linalg.norm(away, axis=1).mean() < 0.5

@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from scipy.spatial.distance import directed_hausdorff
 from trimesh.triangles import closest_point
 
 from covering import cover
@@ -220,3 +221,16 @@ def test_truth_outside_the_estimates_grid_counts_as_missed():
     for frame, shape, iou in ((whole, (30, 30, 30), 1.0), (half, (30, 30, 30), 0.5)):
         estimate = CameraLabels(label_grid(reference, frame, shape), frame)
         assert label_ious(estimate, reference)["kidney"] == pytest.approx(iou)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_hausdorff_agrees_with_scipy_on_dense_samples(seed):
+    a, b = lumpy(seed), lumpy(seed + 10)
+    dense_a, dense_b = (trimesh.sample.sample_surface(
+        trimesh.Trimesh(m.vertices_mm, m.faces, process=False), 60_000, seed=0
+    )[0] for m in (a, b))  # fmt: skip
+    there, back = directed_hausdorff(dense_a, dense_b)[0], directed_hausdorff(dense_b, dense_a)[0]
+    found = surface_distances(a, b)
+    assert found.hausdorff_one_sided_mm == pytest.approx(there, abs=0.12)
+    assert found.hausdorff_mm == pytest.approx(max(there, back), abs=0.12)
+    assert found.hausdorff_mm > 1.0

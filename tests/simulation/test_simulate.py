@@ -134,3 +134,16 @@ def test_drags_start_at_visible_vertices_and_keep_to_their_steps(falloff):
     assert kstest(shares, "uniform").pvalue > 1e-3
     assert kstest(np.array(directions)[:, 2], "uniform", (-1, 2)).pvalue > 1e-3
     assert len(np.unique(starts, axis=0)) > 50
+
+
+def test_one_drag_moves_its_centre_by_its_shift_and_falls_off_as_a_gaussian():
+    given = [(10, 20, 30)], [(3.0, -4.0, 1.0)], [6.0]  # centre, shift, sigma
+    drag = Drags(*(np.array(each, np.float32) for each in given))
+    distance = np.array([0, 3, 6, 12, 18, 24, 60])
+    points = np.array([10.0, 20, 30]) + distance[:, None] * np.array([0.6, 0, 0.8])
+    moved = drag.apply(points) - points
+    np.testing.assert_allclose(moved[0], [3, -4, 1], atol=1e-5)
+    expected = np.exp(-(distance**2) / (2 * 6.0**2))
+    np.testing.assert_allclose(moved @ [3, -4, 1] / 26, expected, atol=2e-6)
+    assert (moved[-1] == 0).all()
+    assert expected[2] == pytest.approx(0.60653, abs=1e-5)  # exp(-1/2) at one sigma

@@ -39,10 +39,10 @@ class _Evidence(Config, frozen=True, kw_only=True, tag_field="kind"):
     def __post_init__(self) -> None:
         self.check_between(self.name, std_mm=(0.05, 50.0), stamp_ns=(0, _LAST_NS))
         for field in ("tip_mm", "point_std_mm", "shared_std_mm"):
-            if hasattr(self, field):
+            if field in self.__struct_fields__:
                 self.check_between(self.name, **{field: (0.0, 50.0)})
         for field in ("place_mm", "places_mm", "point_ct"):
-            if not hasattr(self, field):
+            if field not in self.__struct_fields__:
                 continue
             try:
                 places = np.array(getattr(self, field))
@@ -69,12 +69,13 @@ class _Evidence(Config, frozen=True, kw_only=True, tag_field="kind"):
     @property
     def places(self) -> tuple[Point, ...]:
         """Camera frame, mm."""
-        return self.places_mm if hasattr(self, "places_mm") else (self.place_mm,)  # type: ignore[attr-defined]
+        several = "places_mm" in self.__struct_fields__
+        return self.places_mm if several else (self.place_mm,)  # type: ignore[attr-defined]
 
     def at(self, places_mm: Points, std_mm: float) -> Any:
         """The same at other places, with another deviation; not checked again."""
         moved, places = copy(self), _tuples(places_mm)
-        if hasattr(self, "places_mm"):
+        if "places_mm" in self.__struct_fields__:
             msgspec.structs.force_setattr(moved, "places_mm", places)
         else:
             msgspec.structs.force_setattr(moved, "place_mm", places[0])

@@ -49,11 +49,19 @@ class Renamed:
     if not TYPE_CHECKING:  # to a type checker what is not there stays so
 
         def __getattr__(self, name: str) -> Any:
-            for kind in type(self).__mro__:
-                if said := hint("names", f"{kind.__module__}.{kind.__qualname__}.{name}"):
-                    what = f"{kind.__name__!r} object has no attribute {name!r}{said}"
-                    raise AttributeError(what, name=name, obj=self)
+            kind = type(self)
+            if said := _hints(kind).get(name):
+                what = f"{kind.__name__!r} object has no attribute {name!r}{said}"
+                raise AttributeError(what, name=name, obj=self)
             return object.__getattribute__(self, name)  # raises what led here
+
+
+@cache  # code asks values for what they may lack, in every frame
+def _hints(kind: type) -> Mapping[str, str]:
+    """By the old names of a class's attributes."""
+    owners = {f"{each.__module__}.{each.__qualname__}" for each in kind.__mro__}
+    split = ((old, *old.rpartition(".")[::2]) for old in table()["names"])
+    return {name: hint("names", old) for old, owner, name in split if owner in owners}
 
 
 def in_command(words: Sequence[str]) -> list[str]:
