@@ -204,9 +204,9 @@ def write_scenes(
     asked = options_from(SimulateOptions, {**options}, "write_scenes")
     made_of = load_case(case)
     inside = Path(folder).iterdir() if Path(folder).is_dir() else ()
-    if outliers := [p.name for p in inside if p.name[0] != "." and not (p / "meta.json").is_file()]:
+    if foreign := [p.name for p in inside if p.name[0] != "." and not (p / "meta.json").is_file()]:
         raise InputError(
-            f"{folder} also holds {', '.join(sorted(outliers)[:3])}, which are no scenes. Choose "
+            f"{folder} also holds {', '.join(sorted(foreign)[:3])}, which are no scenes. Choose "
             "another folder, or an empty one."
         )
     config = asked.scene_config().seen_whole(made_of.anatomy)
@@ -518,7 +518,7 @@ def evaluate(
 
     Returns:
         Per scene and part Hausdorff distances, surface and centre distance (mm), IoU, target
-        errors, and for a tracker of a `elastic` model those of the best rigid pose and of a rigid
+        errors, and for a tracker of an `elastic` model those of the best rigid pose and of a rigid
         fit; ``parts`` and ``errors`` have medians, and the worst with its scene.
         docs/conventions.md defines each.
     """

@@ -1,4 +1,4 @@
-"""Old names of core/renamed.toml are gone; whoever uses one is told the new one, which exists."""
+"""Old names of core/renamed.toml are gone; the error of using one names a new one, which exists."""
 
 from __future__ import annotations
 
@@ -249,7 +249,7 @@ def test_a_key_of_a_models_manifest(section, old, elastic_model):
 @of("variables")
 def test_a_variable(section, old, monkeypatch, capsys):
     monkeypatch.setenv(old, "1")
-    assert f"{old}{hint(section, old)}" in "\n".join(doctor._old_names())
+    assert f"{old}{hint(section, old)}" in "\n".join(doctor.old_names())
     sources = "".join(path.read_text() for path in (ROOT / "src").rglob("*.py"))
     assert old not in sources
     assert all(new in sources for new in code(section, old))
@@ -260,7 +260,7 @@ def test_a_group_of_entry_points(section, old, monkeypatch):
     point = EntryPoint("shifted", "acme.peers:PEER", old)
     monkeypatch.setattr(doctor, "entry_points", lambda group: (point,) if group == old else ())
     assert any("acme.peers:PEER" in line and hint(section, old) in line
-               for line in doctor._old_names())  # fmt: skip
+               for line in doctor.old_names())  # fmt: skip
 
 
 @of("distributions")

@@ -12,7 +12,7 @@ from region_objects import BACKGROUND, FAT, HAND, ORGAN, SHAFT, Scene
 
 Pixel = tuple[int, int]
 
-# sRGB. MultiViewCloud are assumptions; the first of each is the usual one.
+# sRGB. Looks are assumptions; the first of each is the usual one.
 COLOURS = {
     ORGAN: ((168, 82, 70), (140, 60, 58), (185, 105, 92)),
     FAT: ((222, 188, 112), (214, 164, 128), (230, 205, 160)),

@@ -1,4 +1,4 @@
-"""The elastic objects' organ as a `elastic` model knows it, and a model made in seconds."""
+"""The elastic objects' organ as an `elastic` model knows it, and a model made in seconds."""
 
 from __future__ import annotations
 

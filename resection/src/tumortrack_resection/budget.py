@@ -250,7 +250,7 @@ def _remedy(plan: ResectionPlan, budget: ErrorBudget) -> str:
     if budget.part != plan.tumor:
         return f"Plan {budget.part} as well, or look from nearer."
     if enough_mm > MARGIN_MM[1]:
-        return "View from nearer, or uncover more of the organ."
+        return "Look from nearer, or uncover more of the organ."
     return f"{enough_mm:g} mm would cover them (--margin, margin_mm)."
 
 

@@ -1,4 +1,4 @@
-"""What sinks are told of the arms."""
+"""What the arms do, as sinks and screens show it."""
 
 from __future__ import annotations
 

@@ -61,11 +61,11 @@ _MIN_COSINE = 0.3  # to the line of sight: surfaces at a flatter angle return li
 _SEEN_WITHIN_MM = 8.0  # of an observed point
 _MAX_HIDDEN = 0.1  # share of the side that faces the camera
 _MIN_SINE = 0.3  # to the line of sight: below it, a direction is along the view
-TrackedEvidence = Mapping[str, tuple[Likely, ...]]
+KnownCauses = Mapping[str, tuple[Likely, ...]]
 
 
 def explained(
-    model: Model, views: Sequence[View], estimate: Estimate, known: TrackedEvidence
+    model: Model, views: Sequence[View], estimate: Estimate, known: KnownCauses
 ) -> tuple[tuple[Likely, ...], str]:
     """Causes of a poor estimate, and what probably happened and what to do, in words. ``known``:
     recent causes by failed check, which are not searched for again."""
@@ -81,7 +81,7 @@ def explained(
 
 
 def causes_of(
-    model: Model, views: Sequence[View], estimate: Estimate | None, known: TrackedEvidence
+    model: Model, views: Sequence[View], estimate: Estimate | None, known: KnownCauses
 ) -> tuple[Likely, ...]:
     """With those that views, evidence and frames before tell; None: there is no estimate."""
     check = check_of(estimate)

@@ -17,7 +17,7 @@ import numpy as np
 
 from tumortrack.assessment.advice import next_evidence
 from tumortrack.assessment.bound import POOR_MM, bounds_of, depths_within_mm
-from tumortrack.assessment.causes import TrackedEvidence, explained
+from tumortrack.assessment.causes import KnownCauses, explained
 from tumortrack.assessment.sight import Sight, sight_of
 from tumortrack.core.assessment import Assessment, ErrorBound, deciding
 from tumortrack.core.errors import NotThisOrgan
@@ -114,7 +114,7 @@ def assessed(
     estimate: Estimate,
     views: Sequence[View],
     model: Model,
-    known: TrackedEvidence = MappingProxyType({}),
+    known: KnownCauses = MappingProxyType({}),
     advise: Advise = "nothing",
     part: int | None = None,
 ) -> Estimate:

@@ -41,7 +41,7 @@ from tumortrack.io.volume import (
     volume_of,
 )
 
-# Options for one organ_kind of input only.
+# Options for one kind of input only.
 _OF_CT, OF_LABELS = ("organ_hu", "tumor_hu"), ("labels", "organ", "tumor", "ct")
 _LEAST_ORGAN_OUTSIDE = 0.02  # of the outer surface
 _LARGEST_SHARE = 0.6  # of organ and tumors that one tumor may take without a note
@@ -165,7 +165,7 @@ def _large_tumors(case: Case) -> list[str]:
 
 
 def refuse_unused(what: str, options: PrepareOptions, *unused: str) -> None:
-    """Refuse options that this organ_kind of input would ignore."""
+    """Refuse options that this kind of input would ignore."""
     default = PrepareOptions()
     given = [name for name in unused if getattr(options, name) != getattr(default, name)]
     if given:
@@ -222,8 +222,8 @@ def _from_volume(paths: list[Path], files: list[Path], options: PrepareOptions) 
     return Case(anatomy, labels, direction_lps(options.up), report, ct, patient)
 
 
-def _where(holds: bool, organ_kind: Kind, **values: float | str) -> list[Finding]:
-    return [Finding(organ_kind, values)] if holds else []
+def _where(holds: bool, kind: Kind, **values: float | str) -> list[Finding]:
+    return [Finding(kind, values)] if holds else []
 
 
 def _selected(

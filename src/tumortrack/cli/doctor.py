@@ -89,7 +89,7 @@ class Doctor:
             with suppress(Exception):  # what fails is among the findings
                 for line in method.loaded.hardware():
                     say(line)
-        for line in _old_names():
+        for line in old_names():
             say(line)
         if broken:
             raise TumortrackError(
@@ -111,7 +111,7 @@ def _statuses() -> Iterator[Status]:
         yield "BROKEN", f"compiled kernels: {error}"
 
 
-def _old_names() -> Iterator[str]:
+def old_names() -> Iterator[str]:
     """Variables that are set, and entry points of groups, that nothing reads any more."""
     for name in filter(os.environ.__contains__, table()["variables"]):
         yield f"nothing reads {name}{hint('variables', name)}"

@@ -138,7 +138,7 @@ def check_affine(path: Path, lps_from_index: Float[np.ndarray, "4 4"]) -> None:
         is_metres = low <= 1000 * min(steps) and 1000 * max(steps) <= high
         raise InputError(
             f"{path}: voxels of {text} mm; allowed are {low:g} to {high:g} mm. Correct the "
-            f"header{': it views like metres' if is_metres else ''}, and export it again."
+            f"header{': it looks like metres' if is_metres else ''}, and export it again."
         )
 
 

@@ -1,5 +1,5 @@
 """The command that makes a folder of another schema again: with its own inputs, as far as its
-manifest names them, else with their kinds in capitals.."""
+manifest names them, else with their kinds in capitals."""
 
 from __future__ import annotations
 

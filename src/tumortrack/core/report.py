@@ -193,7 +193,7 @@ class ViewsReport(_Value, frozen=True, kw_only=True):
 
 class EvidenceReport(_Value, frozen=True, kw_only=True):
     """One piece of evidence: its kind, part, tool and deviation; how far it lies from the answer at
-    most, and which share of what it says is information_gain beside all else (0 to 1).
+    most. ``information_gain``: which share of what it says is new beside all else (0 to 1);
     ``rejected``: it contradicts the rest; ``before``: it is of an earlier frame; ``places_mm``: by
     now, camera frame."""
 

@@ -166,9 +166,9 @@ def list_scenes(folder: Path) -> list[Path]:
 
 def _check_parts(folder: Path, anatomy: Anatomy) -> None:
     last = f"tumor_{len(anatomy.tumors)}"
-    outliers = {path.stem for path in folder.glob("tumor_*.ply")} - set(anatomy.names)
-    if outliers:
-        stray = folder / f"{sorted(outliers)[0]}.ply"
+    beyond = {path.stem for path in folder.glob("tumor_*.ply")} - set(anatomy.names)
+    if beyond:
+        stray = folder / f"{sorted(beyond)[0]}.ply"
         raise InputError(f"{stray} does not follow {last}.ply. Number them without a gap.")
     low, high = _ORGAN_SIZE_MM
     size_mm = anatomy.organ.longest_mm

@@ -197,7 +197,7 @@ def _cameras(source: str | SourceConfig, options: TrackOptions) -> CameraSetup:
     elif options.intrinsics and options.views:
         wrong = "--intrinsics is of one camera; with --views each says its own"
     elif options.scan and not options.moving:
-        wrong = "--scan is of one camera that moves (--moving); several view all the time"
+        wrong = "--scan is of one camera that moves (--moving); several cameras watch all the time"
     if wrong:
         raise InputError(f"{wrong}. Leave it out.")
     return camera_setup((source, *options.views), options.poses, options.moving, options.frame)

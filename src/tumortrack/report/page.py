@@ -304,9 +304,7 @@ def write_run_page(
             ]
             for number, each in enumerate(estimate.report.evidence, start=1)
         ]  # fmt: skip
-        body.append(
-            _section("", _table(["evidence", "tool", "off", "information_gain", ""], known))
-        )
+        body.append(_section("", _table(["evidence", "tool", "off", "new", ""], known)))
     body += map(_figures, (views, slices))
     banner = colours.VERDICTS[verdict]
     rows_of_panels = [views, *pictures.in_fours(slices)]

@@ -256,9 +256,9 @@ def run_panels(estimate: Estimate | None, seen: Seen) -> tuple[list[Panel], list
     """What the camera saw and the surfaces from three sides; and two slices through each tumor."""
     views, slices = list[Panel](), list[Panel]()
     if isinstance(seen.content, DepthFrame):
-        pixel_class = "; tinted: taken for the organ" if seen.pixel_class is not None else ""
+        tint = "; tinted: taken for the organ" if seen.pixel_class is not None else ""
         size = f"{seen.content.intrinsics.width} x {seen.content.intrinsics.height} pixels"
-        caption = f"depth image, {size}, near is bright{pixel_class}"
+        caption = f"depth image, {size}, near is bright{tint}"
         views.append((caption, depth_picture(seen.content, seen.pixel_class)))
     points_mm = _thinned(seen.cloud if estimate and seen.cloud else seen.content)
     meshes, structures = ({}, {}) if estimate is None else (estimate.meshes, estimate.structures)

@@ -170,9 +170,9 @@ def check_place(out: Path, overwrite: bool) -> None:
     entries = [entry for entry in report["scenes"] if isinstance(entry, dict)]
     pictures = {f"{entry.get('name')}.png" for entry in entries}
     drawn = {path.name for path in (out / "scenes").glob("*")}
-    if outliers := sorted((inside - _OURS) | (drawn - pictures)):
+    if foreign := sorted((inside - _OURS) | (drawn - pictures)):
         raise InputError(
-            f"{out} also holds {', '.join(outliers[:3])}, which no report has; --overwrite would "
+            f"{out} also holds {', '.join(foreign[:3])}, which no report has; --overwrite would "
             "lose it. Move it away first, or choose another path."
         )
 

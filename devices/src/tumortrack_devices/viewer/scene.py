@@ -122,7 +122,7 @@ class ViewerScene:
         clear = np.zeros((2, 2, 4), np.uint8)
         self._slice = nodes.add_image("/estimate/slice", clear, 1, 1, format="png", **_FLAT)
         self._control = nodes.add_frame("/workcell", show_axes=False, visible=False)
-        # View, place and node by name
+        # Look, place and node by name
         self._drawn: dict[str, tuple[dict[str, Any], np.ndarray, Any]] = {}
 
     def _cloud(

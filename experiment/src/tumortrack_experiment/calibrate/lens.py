@@ -183,7 +183,7 @@ def _lens_warnings(said: dict[str, Any], tilt: float) -> list[str]:
 
 
 def rays_apart(one: Lens, other: Lens) -> Float64[np.ndarray, " n"]:
-    """How far apart the two view, as a share of the depth, all over the image."""
+    """How far apart the two look, as a share of the depth, all over the image."""
     return np.linalg.norm(pixel_rays(one) - pixel_rays(other), axis=2)[::8, ::8].ravel()
 
 

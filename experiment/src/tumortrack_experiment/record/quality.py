@@ -71,7 +71,7 @@ class DepthQuality(Config, frozen=True, kw_only=True):
 
 
 class DepthMeter:
-    """MultiViewCloud at frame after frame, of one size."""
+    """Looks at frame after frame, of one size."""
 
     def __init__(self, range_mm: tuple[float, float]) -> None:
         self._range_mm, self.frames = range_mm, 0
