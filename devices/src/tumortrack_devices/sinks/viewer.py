@@ -321,7 +321,7 @@ class ViewerSink:
             controls.click(seen, place_in_camera, organ)
         except InputError as error:
             if not organ or seen.picture is not None:
-                event.client.add_notification("This click trained no colour", str(error))
+                event.client.add_notification("No colour was learned from this click", str(error))
         if organ:
             controls.picked_mm = place_mm
             self._scene.mark(place_mm)
