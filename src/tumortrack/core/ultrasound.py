@@ -1,0 +1,172 @@
+"""What a tracked ultrasound probe recorded: borders of parts in its images, and its poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64, UInt8
+
+from tumortrack.core.evidence import Outline
+from tumortrack.core.geometry import IDENTITY, Affine, Points, transform_points
+
+# Places on one border that are nearer err alike: a reader's drawing is smooth over so much.
+APART_MM = 3.0
+_MOST_PLANES = 150  # of a fit, evenly in time: more cost time and hardly tell more
+_LONGEST_GAP_S = 0.5  # between poses; between farther ones a hand may have turned back
+
+
+class ImageErrors(NamedTuple):
+    """What is wrong in all images of a recording alike. ``lag_s``: by which their stamps are late:
+    an image of time t shows what was before the probe at t - lag. ``depth``, ``width``: by which
+    a length along the beam and across it is longer than the pixels say, as a share: with another
+    speed of sound than the scanner presumes."""
+
+    lag_s: float = 0.0
+    depth: float = 0.0
+    width: float = 0.0
+
+
+NO_ERRORS = ImageErrors()
+
+
+@dataclass(frozen=True, eq=False)
+class ProbeRecording:
+    """Places on the borders of parts, in pixels of the images, and where the probe was.
+
+    Attributes:
+        tool: the probe's name.
+        frame: of the poses.
+        stamps_s: of the poses, rising.
+        frame_from_probe: poses, mm.
+        probe_from_image: (column, row, 0) -> mm; a pixel's centre is a whole number.
+        parts: names.
+        places_px: column, row; sorted by plane.
+        part: of each place, the number of its part.
+        plane: of each place, the number of its image.
+        image_stamps_s: of each place, its image's.
+        std_mm: of each place.
+        shared_std_mm: of a shift of all places alike, as by a calibration.
+        camera_from_frame: to the frame of the answer.
+        notes: on what was left out in reading.
+    """
+
+    tool: str
+    frame: str
+    stamps_s: Float64[np.ndarray, " m"]
+    frame_from_probe: Float64[np.ndarray, "m 4 4"]
+    probe_from_image: Affine
+    parts: tuple[str, ...]
+    places_px: Float64[np.ndarray, "n 2"]
+    part: Int64[np.ndarray, " n"]
+    plane: Int64[np.ndarray, " n"]
+    image_stamps_s: Float64[np.ndarray, " n"]
+    std_mm: float = 1.0
+    shared_std_mm: float = 0.0
+    camera_from_frame: Affine = IDENTITY
+    notes: tuple[str, ...] = ()
+
+    def places_mm(self, errors: ImageErrors = NO_ERRORS) -> Points:
+        """Of all places in the frame of the answer; NaN where no pose is known."""
+        scales = 1 + np.array([errors.width, errors.depth])
+        in_image = np.column_stack([self.places_px * scales, np.zeros(len(self.places_px))])
+        in_probe = transform_points(self.probe_from_image, in_image)
+        stamps_s, known = self.image_stamps_s - errors.lag_s, self.stamps_s
+        after = np.clip(np.searchsorted(known, stamps_s), 1, len(known) - 1)
+        gap_s = known[after] - known[after - 1]
+        inside = (stamps_s >= known[0]) & (stamps_s <= known[-1]) & (gap_s <= _LONGEST_GAP_S)
+        from scipy.spatial.transform import Rotation, Slerp  # slow to import
+
+        at_s = np.clip(stamps_s, known[0], known[-1])
+        turns = Slerp(known, Rotation.from_matrix(self.frame_from_probe[:, :3, :3]))(at_s)
+        shifts = self.frame_from_probe[:, :3, 3]
+        share = ((at_s - known[after - 1]) / gap_s)[:, None]
+        places_mm = turns.apply(in_probe) + (1 - share) * shifts[after - 1] + share * shifts[after]
+        places_mm[~inside] = np.nan
+        return transform_points(self.camera_from_frame, places_mm)
+
+    def outlines(self, errors: ImageErrors = NO_ERRORS) -> tuple[Outline, ...]:
+        """One of each part in each plane."""
+        places_mm = self.places_mm(errors)
+        known = np.isfinite(places_mm).all(1)
+        found = []
+        for number in np.unique(self.plane[known]):
+            for part in np.unique(self.part[mine := known & (self.plane == number)]):
+                some = places_mm[mine & (self.part == part)]
+                found.append(
+                    Outline(
+                        places_mm=tuple(map(tuple, some.tolist())),
+                        part=self.parts[part],
+                        std_mm=self.std_mm,
+                        shared_std_mm=self.shared_std_mm,
+                        tool=self.tool,
+                    )
+                )
+        return tuple(found)
+
+    def thinned(self, most: int) -> ProbeRecording:
+        """At most so many places, evenly over time and along the borders."""
+        planes = np.unique(self.plane)
+        count = min(len(planes), _MOST_PLANES, most)
+        chosen = planes[np.unique(np.linspace(0, len(planes) - 1, count).round().astype(int))]
+        each, keep = max(most // len(chosen), 1), np.zeros(len(self.plane), bool)
+        for number in chosen:
+            mine = np.flatnonzero(self.plane == number)
+            some = np.linspace(0, len(mine) - 1, min(len(mine), each)).round().astype(int)
+            keep[mine[np.unique(some)]] = True
+        return replace(
+            self,
+            places_px=self.places_px[keep],
+            part=self.part[keep],
+            plane=self.plane[keep],
+            image_stamps_s=self.image_stamps_s[keep],
+        )
+
+
+def border_px(
+    inside: Bool[np.ndarray, "h w"], field: Bool[np.ndarray, "h w"] | None = None
+) -> Float64[np.ndarray, "n 2"]:
+    """Where a part's region ends in an image: (column, row) halfway between two pixels. It does not
+    end where the image does, nor at the edge of the ``field`` that the probe sees."""
+    seen = np.ones(inside.shape, bool) if field is None else field
+    across = (inside[:, 1:] != inside[:, :-1]) & seen[:, 1:] & seen[:, :-1]
+    down = (inside[1:] != inside[:-1]) & seen[1:] & seen[:-1]
+    rows, columns = np.nonzero(across)
+    lower_rows, lower_columns = np.nonzero(down)
+    return np.concatenate(
+        [
+            np.column_stack([columns + 0.5, rows]),
+            np.column_stack([lower_columns, lower_rows + 0.5]),
+        ]
+    )
+
+
+def spread_px(
+    places_px: Float64[np.ndarray, "n 2"], mm_per_pixel: tuple[float, float]
+) -> Float64[np.ndarray, "m 2"]:
+    """One place for each ``APART_MM``: that nearest to the mean of those about it."""
+    cells = np.floor(places_px * mm_per_pixel / APART_MM).astype(int)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    cell = cell.ravel()
+    count = np.bincount(cell)
+    means = np.column_stack([np.bincount(cell, places_px[:, k]) / count for k in (0, 1)])
+    away = ((places_px - means[cell]) ** 2).sum(1)
+    order = np.lexsort([away, cell])
+    return places_px[order[np.r_[True, np.diff(cell[order]) > 0]]] if len(order) else places_px
+
+
+def part_borders_px(
+    labels: UInt8[np.ndarray, "h w"],
+    parts: dict[int, str],
+    mm_per_pixel: tuple[float, float],
+    field: Bool[np.ndarray, "h w"] | None = None,
+) -> dict[str, Float64[np.ndarray, "n 2"]]:
+    """Of an image of labels, by part: the ``parts`` of the labels that are there. The organ, the
+    part of label 1, is what any label covers: a tumor's border inside it is none of the organ's."""
+    found = {}
+    for label in np.intersect1d(np.unique(labels), list(parts)).tolist():
+        inside = labels > 0 if label == 1 else labels == label
+        if len(places := border_px(inside, field)):
+            found[parts[label]] = spread_px(places, mm_per_pixel)
+    return found
