@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
 from tumortrack.core.evidence import Outline
-from tumortrack.core.geometry import IDENTITY, Affine, Points, transform_points
+from tumortrack.core.geometry import Affine, Points, transform_points
 
 # Places on one border that are nearer err alike: a reader's drawing is smooth over so much.
 APART_MM = 3.0
@@ -64,7 +64,7 @@ class ProbeRecording:
     image_stamps_s: Float64[np.ndarray, " n"]
     std_mm: float = 1.0
     shared_std_mm: float = 0.0
-    camera_from_frame: Affine = IDENTITY
+    camera_from_frame: Affine = field(default_factory=lambda: np.eye(4))
     notes: tuple[str, ...] = ()
 
     def places_mm(self, errors: ImageErrors = NO_ERRORS) -> Points:
