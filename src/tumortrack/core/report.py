@@ -41,6 +41,8 @@ Kind = Literal[
 
 
 FAR_OFF = "miss", "depths"  # what makes an answer poor that nothing else speaks against
+# Known well enough: 0.5 mm of a probe's way at 10 mm/s, and 1 mm of 5 cm.
+_KNOWN_LAG_S, _KNOWN_SCALE = 0.05, 0.02
 
 
 class _Said(msgspec.Struct, forbid_unknown_fields=True):
@@ -208,6 +210,52 @@ class EvidenceReport(_Value, frozen=True, kw_only=True):
     places_mm: tuple[Point, ...] = ()
 
 
+class ProbeReport(_Value, frozen=True, kw_only=True):
+    """What is wrong in all images of a tracked probe (``core.ultrasound.ImageErrors``), with
+    standard deviations."""
+
+    tool: str
+    places: int
+    planes: int
+    lag_s: float
+    lag_std_s: float
+    depth: float
+    depth_std: float
+    width: float
+    width_std: float
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """What the planes leave open."""
+        known = {
+            "lag": self.lag_std_s <= _KNOWN_LAG_S,
+            "depth": self.depth_std <= _KNOWN_SCALE,
+            "width": self.width_std <= _KNOWN_SCALE,
+        }
+        return tuple(name for name, is_known in known.items() if not is_known)
+
+    @property
+    def message(self) -> str:
+        late = "the poses lag the images" if self.lag_s < 0 else "images lag the poses"
+        said = [
+            f"{self.tool}: {self.planes} planes; {late} by {abs(self.lag_s):.2f} s "
+            f"(one deviation {self.lag_std_s:.2f})"
+        ]
+        for along, share, std in (
+            ("along the beam", self.depth, self.depth_std),
+            ("across it", self.width, self.width_std),
+        ):
+            longer = "shorter" if share < 0 else "longer"
+            said.append(
+                f"lengths {along} are {abs(share):.1%} {longer} than stated "
+                f"(one deviation {std:.1%})"
+            )
+        if self.undetermined:
+            open_ = " and ".join(self.undetermined)
+            said.append(f"undetermined: {open_}; sweep forth and back over the organ's ends")
+        return "; ".join(said)
+
+
 class NextEvidence(_Value, frozen=True, kw_only=True):
     """What to learn next of a part, and what one standard deviation of its middle along its least
     sure axis, and its bound, are and would be ``then``. ``place_mm`` and ``direction`` (unit), by
@@ -301,6 +349,7 @@ class FitReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     motion: MotionReport | None = None
     views: ViewsReport | None = None
     evidence: tuple[EvidenceReport, ...] = ()
+    probes: tuple[ProbeReport, ...] = ()
     fit_mm: Residuals | None = None
     timings: dict[str, float] = {}
     unseen: float | None = None

@@ -9,11 +9,12 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
 from tumortrack.core.evidence import Outline
-from tumortrack.core.geometry import Affine, Points, transform_points
+from tumortrack.core.geometry import Affine, Points, rigid, transform_points
 
 # Places on one border that are nearer err alike: a reader's drawing is smooth over so much.
 APART_MM = 3.0
 _MOST_PLANES = 150  # of a fit, evenly in time: more cost time and hardly tell more
+_SMOOTH_S = 0.25  # shorter than what a hand does with a probe
 _LONGEST_GAP_S = 0.5  # between poses; between farther ones a hand may have turned back
 
 
@@ -72,7 +73,8 @@ class ProbeRecording:
         scales = 1 + np.array([errors.width, errors.depth])
         in_image = np.column_stack([self.places_px * scales, np.zeros(len(self.places_px))])
         in_probe = transform_points(self.probe_from_image, in_image)
-        stamps_s, known = self.image_stamps_s - errors.lag_s, self.stamps_s
+        stamps_s, plane = np.unique(self.image_stamps_s, return_inverse=True)
+        stamps_s, known = stamps_s - errors.lag_s, self.stamps_s
         after = np.clip(np.searchsorted(known, stamps_s), 1, len(known) - 1)
         gap_s = known[after] - known[after - 1]
         inside = (stamps_s >= known[0]) & (stamps_s <= known[-1]) & (gap_s <= _LONGEST_GAP_S)
@@ -80,11 +82,24 @@ class ProbeRecording:
 
         at_s = np.clip(stamps_s, known[0], known[-1])
         turns = Slerp(known, Rotation.from_matrix(self.frame_from_probe[:, :3, :3]))(at_s)
-        shifts = self.frame_from_probe[:, :3, 3]
-        share = ((at_s - known[after - 1]) / gap_s)[:, None]
-        places_mm = turns.apply(in_probe) + (1 - share) * shifts[after - 1] + share * shifts[after]
-        places_mm[~inside] = np.nan
+        shifts, share = (
+            self.frame_from_probe[:, :3, 3],
+            ((at_s - known[after - 1]) / gap_s)[:, None],
+        )
+        moved = (1 - share) * shifts[after - 1] + share * shifts[after]
+        moved[~inside] = np.nan
+        places_mm = np.einsum("nij,nj->ni", turns.as_matrix()[plane], in_probe) + moved[plane]
         return transform_points(self.camera_from_frame, places_mm)
+
+    @property
+    def known_mm(self) -> Points:
+        """The places as recorded, where a pose is known."""
+        places_mm = self.places_mm()
+        return places_mm[np.isfinite(places_mm).all(1)]
+
+    def moved(self, by_mm: Float64[np.ndarray, " 3"]) -> ProbeRecording:
+        """In a frame whose origin lies elsewhere."""
+        return replace(self, camera_from_frame=rigid(np.eye(3), by_mm) @ self.camera_from_frame)
 
     def outlines(self, errors: ImageErrors = NO_ERRORS) -> tuple[Outline, ...]:
         """One of each part in each plane."""
@@ -104,6 +119,20 @@ class ProbeRecording:
                     )
                 )
         return tuple(found)
+
+    def smoothed(self) -> ProbeRecording:
+        """With poses averaged over ``_SMOOTH_S``: what a tracker's noise adds would pull a lag to
+        the middle between two poses, where interpolation lessens it."""
+        from scipy.ndimage import uniform_filter1d
+
+        many = round(_SMOOTH_S / float(np.median(np.diff(self.stamps_s))))
+        size = min(2 * (many // 2) + 1, len(self.stamps_s))
+        rows = np.column_stack([self.stamps_s, self.frame_from_probe.reshape(-1, 16)])
+        means = uniform_filter1d(rows, size, axis=0, mode="nearest")
+        poses = means[:, 1:].reshape(-1, 4, 4)
+        left, _, right = np.linalg.svd(poses[:, :3, :3])
+        poses[:, :3, :3] = left @ right
+        return replace(self, stamps_s=means[:, 0], frame_from_probe=poses)
 
     def thinned(self, most: int) -> ProbeRecording:
         """At most so many places, evenly over time and along the borders."""

@@ -27,13 +27,15 @@ from tumortrack.registration.motion import POSE, ElasticMotion, seen_from_first
 
 _WIDTHS = 4.0  # of the robust kernel, in standard deviations
 _LEAST_WIDTH_MM = 4.0  # so that fits from starts some millimetres off are drawn
-_SURFACE_MM = 1.0  # of the model's surfaces, segmentation included: ``sigma_mm`` of the points
+SURFACE_MM = 1.0  # of the model's surfaces, segmentation included: ``sigma_mm`` of the points
 # Of single places a share is of something else, and lies anywhere within a hand's breadth: assumed.
 _FALSE, _WITHIN_MM = 0.05, 40.0
 _RIGID_MM = 4.0  # error of the undeformed organ at best
 _DRIFT = 0.1  # error along an axis of where tissue is said to go, per way that it went
 _OLD_MM = 5.0  # what is less sure tells nothing any more
-_MOST = 1000  # places: with so many an answer takes a second, or several where they contradict it
+MOST_PLACES = (
+    1000  # places: with so many an answer takes a second, or several where they contradict it
+)
 _MOST_KEPT = 200  # from frame to frame, the newest: a frame then takes three times as long
 
 
@@ -76,17 +78,17 @@ class Terms:
         """As the points' cost: for small residuals their squares, in standard deviations."""
         squares = (self.residuals_mm / self.width_mm) ** 2
         alone = (self.width_mm / self.std_mm) ** 2 @ (squares / (1 + squares))
-        return float(alone - self.shifts @ self._own_precision @ self.shifts)
+        return float(alone - self.shifts @ self.own_precision @ self.shifts)
 
     @cached_property
-    def _own_precision(self) -> Float64[np.ndarray, "s s"]:
+    def own_precision(self) -> Float64[np.ndarray, "s s"]:
         return np.eye(self.by_shifts.shape[1]) + (self.by_shifts.T * self.weights) @ self.by_shifts
 
     @cached_property
     def shifts(self) -> Float64[np.ndarray, " s"]:
         """The most likely at this motion, in standard deviations."""
         slope = (self.by_shifts.T * self.weights) @ self.residuals_mm
-        return -np.linalg.solve(self._own_precision, slope)
+        return -np.linalg.solve(self.own_precision, slope)
 
     @property
     def contradicting(self) -> Int64[np.ndarray, " k"]:
@@ -103,7 +105,7 @@ class Terms:
         weighted = self.by_motion.T * self.weights
         across = weighted @ self.by_shifts
         curvature += weighted @ self.by_motion
-        curvature -= across @ np.linalg.solve(self._own_precision, across.T)
+        curvature -= across @ np.linalg.solve(self.own_precision, across.T)
         gradient += weighted @ (self.residuals_mm + self.by_shifts @ self.shifts)
         return self.cost
 
@@ -126,7 +128,7 @@ class EvidenceTerms:
 
     @classmethod
     def from_evidence(
-        cls, evidence: Sequence[Evidence], parts: Sequence[str], most: float = _MOST
+        cls, evidence: Sequence[Evidence], parts: Sequence[str], most: float = MOST_PLACES
     ) -> EvidenceTerms | None:
         """``parts``: names of what can be touched (``Anatomy.closed``). None: there is no evidence.
         Raises InputError: of a part that the organ lacks, or that is open; too many places."""
@@ -149,7 +151,7 @@ class EvidenceTerms:
                     f"{each.name} {number + 1} is of {name!r}; this organ has {', '.join(parts)}."
                 )
             away_mm = 0.0 if isinstance(each, Outline) else each.tip_mm
-            std_mm = math.hypot(each.std_mm, _SURFACE_MM)
+            std_mm = math.hypot(each.std_mm, SURFACE_MM)
             kind = parts.index(name), away_mm, isinstance(each, FreeSpace), std_mm
             surfaces += [(place, *kind, *about) for place in each.places]
         if not surfaces and not points:

@@ -15,15 +15,17 @@ from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.evidence import FEWEST_TOUCHES, Evidence
 from tumortrack.core.report import SmoothingReport
 from tumortrack.core.types import Anatomy, DepthError, SensorCloud, View
+from tumortrack.core.ultrasound import ProbeRecording
 from tumortrack.registration.compliance import RefinedFit
 from tumortrack.registration.estimate import EstimateMaker, Found
 from tumortrack.registration.evidence import EvidenceTerms, TrackedEvidence, propagate
 from tumortrack.registration.frame import Frame
-from tumortrack.registration.gauss_newton import RegistrationResult
+from tumortrack.registration.gauss_newton import RegistrationResult, prior_precision
 from tumortrack.registration.model import RegistrationModel
-from tumortrack.registration.motion import ElasticMotion, blend
+from tumortrack.registration.motion import POSE, ElasticMotion, blend
 from tumortrack.registration.multi_view import MultiViewCloud
-from tumortrack.registration.registration import select_best
+from tumortrack.registration.probe import FoundErrors, find_errors
+from tumortrack.registration.registration import Registration, select_best
 from tumortrack.registration.search import PosePrior, distance_mm
 
 _MOVED_MM = 2.5  # between live frames: what moves farther is found again from the start
@@ -53,18 +55,32 @@ class RegistrationLocator:
         any_pose: bool = False,
     ) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``."""
-        alone = isinstance(views[0].full_view, SensorCloud) and not len(
-            views[0].full_view.points_mm
-        )
-        fewest = FEWEST_TOUCHES if alone else FEWEST_POINTS
-        frame = Frame(self._model, views[0].cloud, seed, np.random.default_rng(seed), fewest)
-        points = self._points(
-            frame, views, evidence=EvidenceTerms.from_evidence(evidence, self._touchable)
-        )
-        method = self._anyhow if any_pose else self._registration
-        fit = method.register(points, None, frame.stage)
+        frame, fit, method = self._registered(views, seed, evidence, any_pose)
         found = self._found(fit, method.prior, tuple(evidence))
         return self._maker.estimate(frame, views, found, self._refined(fit, frame), grid=grid)
+
+    def errors_of(
+        self,
+        recording: ProbeRecording,
+        views: Sequence[View],
+        seed: int,
+        evidence: Sequence[Evidence],
+        any_pose: bool,
+    ) -> FoundErrors:
+        """What is wrong in all images of a recording, beside what else is known of a still organ:
+        ``views`` and ``evidence``, or, where these are the recording's own places, its elasticity
+        alone."""
+        frame, fit, _ = self._registered(views, seed, evidence, any_pose)
+        if _is_alone(views):
+            shape = fit.motion.shape
+            precision = prior_precision(shape, self._model.config.refine)
+            precision[:POSE] = precision[:, :POSE] = 0.0  # it may lie anywhere
+            off = np.append(np.zeros(POSE), fit.motion.coefficients - shape.body.mean)
+            return find_errors(recording, fit.motion, precision, off)
+        motion = self._refined(fit, frame).motion
+        assert motion.covariance is not None
+        precision = np.linalg.inv(motion.covariance)
+        return find_errors(recording, motion, precision, np.zeros(len(precision)))
 
     def follow(self, views: Sequence[View], last: Estimate | None, how: FollowOptions) -> Estimate:
         """See ``tracking.tracker.Tracker.follow``."""
@@ -90,6 +106,17 @@ class RegistrationLocator:
         self._maker.warm(fit, method.refine_compliance(fit))
         for surface in range(len(self._touchable)):
             shape.field(surface)
+
+    def _registered(
+        self, views: Sequence[View], seed: int, evidence: Sequence[Evidence], any_pose: bool
+    ) -> tuple[Frame, RegistrationResult, Registration]:
+        fewest = FEWEST_TOUCHES if _is_alone(views) else FEWEST_POINTS
+        frame = Frame(self._model, views[0].cloud, seed, np.random.default_rng(seed), fewest)
+        points = self._points(
+            frame, views, evidence=EvidenceTerms.from_evidence(evidence, self._touchable)
+        )
+        method = self._anyhow if any_pose else self._registration
+        return frame, method.register(points, None, frame.stage), method
 
     def _points(
         self,
@@ -189,3 +216,9 @@ class RegistrationLocator:
         if np.linalg.norm(behind_mm, axis=1).max() >= _BEHIND_MM:
             return refined, 0.0
         return replace(refined, motion=mean), past_s * (1 - share) / share
+
+
+def _is_alone(views: Sequence[View]) -> bool:
+    """Whether no camera saw anything: places that were touched or outlined are the cloud."""
+    full_view = views[0].full_view
+    return isinstance(full_view, SensorCloud) and not len(full_view.points_mm)

@@ -19,17 +19,20 @@ from tumortrack.core.cloud import CloudConfig
 from tumortrack.core.config import check_seed
 from tumortrack.core.errors import InputError, NotThisOrgan
 from tumortrack.core.estimate import Estimate, FollowOptions
-from tumortrack.core.evidence import CAMERA, Evidence, touched
+from tumortrack.core.evidence import CAMERA, FEWEST_TOUCHES, Evidence, touched
 from tumortrack.core.geometry import IDENTITY, Affine, rigid, transform_points
 from tumortrack.core.process import tune_malloc
+from tumortrack.core.report import ProbeReport
 from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud, View
+from tumortrack.core.ultrasound import ProbeRecording
 from tumortrack.io.case import Case
 from tumortrack.registration.base_model import Model
-from tumortrack.registration.evidence import EvidenceTerms
+from tumortrack.registration.evidence import MOST_PLACES, EvidenceTerms
 from tumortrack.registration.locator import RegistrationLocator
 from tumortrack.registration.method import Locator, method_of_config
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.registration.motion import ElasticMotion, seen_from_first
+from tumortrack.registration.probe import UNKNOWN, believed
 from tumortrack.segmentation import RegionConfig
 from tumortrack.segmentation.smoothing import clean_cloud
 from tumortrack.tracking.model_files import case_model
@@ -75,7 +78,7 @@ class Tracker:
         points: SensorCloud | Float[np.ndarray, "n 3"],
         *,
         views: Sequence[View] = (),
-        evidence: Sequence[Evidence] = (),
+        evidence: Sequence[Evidence | ProbeRecording] = (),
         full_view: DepthFrame | SensorCloud | None = None,
         grid: int = 160,
         seed: int = 0,
@@ -87,8 +90,9 @@ class Tracker:
             points: of the organ, as the camera sees them: n x 3, camera frame, mm.
             views: of further cameras, or from other places, while the organ rests.
             evidence: what else is known of where it lies then: ``Touch``, ``Landmark``, ``Grasp``,
-                ``Outline``, ``FreeSpace``, in the frame of ``points``. There may be no points: then
-                it has twelve places or more, touched or outlined.
+                ``Outline``, ``FreeSpace``, in the frame of ``points``; and what a tracked
+                ultrasound probe recorded (``read_ultrasound``). There may be no points: then it
+                has twelve places or more, touched or outlined.
             full_view: all that the camera saw, by which the estimate is judged; default:
             ``points``.
             grid: voxels along the longest side of the labelled volume.
@@ -106,23 +110,21 @@ class Tracker:
         check_seed(seed)
         cloud = cloud_of(points)
         all_views: Sequence[View]
-        all_views, pieces = _views_of(cloud, full_view, views), _evidence_of(evidence)
-        if frame != CAMERA:
-            return replace(self._located_in_frame(cloud, pieces, grid, seed), frame=frame)
-        return self._located(cloud, all_views, pieces, grid, seed)
-
-    def _located_in_frame(
-        self, cloud: SensorCloud, pieces: Sequence[Evidence], grid: int, seed: int
-    ) -> Estimate:
-        """By evidence alone in any frame: as if a camera, which could lie any way, saw it."""
-        if len(cloud.points_mm) or not pieces:
+        all_views = _views_of(cloud, full_view, views)
+        pieces, recordings = _evidence_of(evidence)
+        if frame == CAMERA:
+            return self._located(cloud, all_views, pieces, grid, seed, recordings)
+        if len(cloud.points_mm) or not (pieces or recordings):
             raise InputError("clouds are in a camera's frame; only evidence without one is not.")
-        away_mm = _BEFORE_MM - np.concatenate([each.places for each in pieces]).mean(0)
-        moved = [each.at(np.array(each.places) + away_mm, each.std_mm) for each in pieces]
-        found = self._located(
-            cloud, (View(cloud, cloud, IDENTITY),), tuple(moved), grid, seed, True
-        )
-        return _shifted(found, -away_mm)
+        # By evidence alone in any frame: as if a camera, which could lie any way, saw it.
+        places = [np.array(each.places) for each in pieces]
+        places += [each.known_mm for each in recordings]
+        away_mm = _BEFORE_MM - np.concatenate(places).mean(0)
+        pieces = tuple(each.at(np.array(each.places) + away_mm, each.std_mm) for each in pieces)
+        recordings = tuple(each.moved(away_mm) for each in recordings)
+        alone = (View(cloud, cloud, IDENTITY),)
+        found = self._located(cloud, alone, pieces, grid, seed, recordings, any_pose=True)
+        return replace(_shifted(found, -away_mm), frame=frame)
 
     def _located(
         self,
@@ -131,22 +133,48 @@ class Tracker:
         pieces: tuple[Evidence, ...],
         grid: int,
         seed: int,
+        recordings: tuple[ProbeRecording, ...],
         any_pose: bool = False,
     ) -> Estimate:
         """``any_pose``: it may lie any way."""
+        pieces, probes = self._with_recordings(all_views, pieces, seed, recordings, any_pose)
         shown, given = tuple[Evidence, ...](), pieces
         if not len(cloud.points_mm) and pieces:
-            alone, shown, pieces = touched(pieces, self.model.parts[0])
-            all_views = (View(replace(alone, stamp_ns=cloud.stamp_ns), cloud, IDENTITY),)
+            all_views, shown, pieces = _alone(cloud, pieces, self.model.parts[0])
 
         def located(all_views: Sequence[View]) -> Estimate:
             found = self._locator.locate(all_views, grid, seed, pieces, any_pose)
-            found = _with_pieces(found, shown, given)
+            found = _with_pieces(found, shown, given).reporting(probes=probes)
             return judged(found, all_views, factor=self.model.bound_factor)
 
         with self._explaining_errors(all_views, _DEFAULTS, bool(pieces)):
             estimate, all_views = select_piece(all_views, located)
         return assessed(estimate, all_views, self.model, advise="all", part=self._advised)
+
+    def _with_recordings(
+        self,
+        all_views: Sequence[View],
+        pieces: tuple[Evidence, ...],
+        seed: int,
+        recordings: tuple[ProbeRecording, ...],
+        any_pose: bool,
+    ) -> tuple[tuple[Evidence, ...], tuple[ProbeReport, ...]]:
+        """With what recordings outline, once their images' errors are found."""
+        locator, reports, known = self._locator, list[ProbeReport](), pieces
+        if recordings and not isinstance(locator, RegistrationLocator):
+            raise InputError("recordings need a model that knows a motion: give the case itself.")
+        for recording in recordings:
+            assert isinstance(locator, RegistrationLocator)
+            most = (MOST_PLACES - sum(len(each.places) for each in known)) // len(recordings)
+            thinned = recording.thinned(max(most, FEWEST_TOUCHES))
+            views, others, cloud = all_views, known, all_views[0].cloud
+            if not len(cloud.points_mm):
+                outlines = believed(thinned, UNKNOWN).outlines()
+                views, _, others = _alone(cloud, (*known, *outlines), self.model.parts[0])
+            found = locator.errors_of(thinned, views, seed, others, any_pose)
+            pieces += believed(thinned, found).outlines(found.errors)
+            reports.append(found.report(thinned))
+        return pieces, tuple(reports)
 
     def follow(
         self,
@@ -165,7 +193,7 @@ class Tracker:
         # A fit that is suddenly worse may be to another object.
         strictly = how.allow_flip if last is None else last.quality != "good" or not _unusual(last)
         all_views: Sequence[View]
-        all_views, pieces = _views_of(cloud, full_view, views), _evidence_of(evidence)
+        all_views, (pieces, _) = _views_of(cloud, full_view, views), _evidence_of(evidence, False)
         if pieces:
             how = msgspec.structs.replace(how, evidence=(*how.evidence, *pieces))
 
@@ -287,10 +315,25 @@ def _views_of(
     return tuple(map(_cleaned, (View(cloud, full_view or cloud, IDENTITY), *others)))
 
 
-def _evidence_of(evidence: Sequence[Evidence]) -> tuple[Evidence, ...]:
+def _evidence_of(
+    evidence: Sequence[Evidence | ProbeRecording], recorded: bool = True
+) -> tuple[tuple[Evidence, ...], tuple[ProbeRecording, ...]]:
+    """``recorded``: recordings are allowed among it."""
     kinds = "evidence is of Touch, Landmark, Grasp, Outline and FreeSpace"
     hint = "evidence=[Touch(place_mm=(x, y, z))]; further cameras' views are views=[...]"
-    return _all_of(Evidence, evidence, kinds, hint)
+    allowed = Evidence | ProbeRecording if recorded else Evidence
+    every = _all_of(allowed, evidence, kinds, hint)
+    recordings = tuple(each for each in every if isinstance(each, ProbeRecording))
+    return tuple(each for each in every if not isinstance(each, ProbeRecording)), recordings
+
+
+def _alone(
+    cloud: SensorCloud, pieces: tuple[Evidence, ...], organ: str
+) -> tuple[tuple[View], tuple[Evidence, ...], tuple[Evidence, ...]]:
+    """Without a camera: a view of what was touched or outlined of the organ; of what it is made;
+    and the rest."""
+    places, shown, others = touched(pieces, organ)
+    return (View(replace(places, stamp_ns=cloud.stamp_ns), cloud, IDENTITY),), shown, others
 
 
 def _all_of(kind: Any, given: Any, what: str, hint: str) -> tuple[Any, ...]:
