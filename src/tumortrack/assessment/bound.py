@@ -97,9 +97,15 @@ def depths_within_mm(report: FitReport, name: str) -> float:
     return _WITHIN * report.motion.depth_share * math.hypot(*center_mm)
 
 
+def probes_within_mm(report: FitReport) -> float:
+    """How far off all parts are at most (95 %) by what recordings of probes leave open."""
+    return _WITHIN * math.hypot(*(probe.shift_std_mm for probe in report.probes))
+
+
 def bound_mm(report: FitReport, name: str, share: float = 1.0) -> float | None:
-    """How far off a part is at most (95 %), without a factor: what was learned, and what the
-    camera's depths err by beside that; at least how far off it is in fits that are as likely.
+    """How far off a part is at most (95 %), without a factor: what was learned, and beside that
+    what the camera's depths err by and probes leave open; at least how far off it is in fits that
+    are as likely.
 
     Args:
         share: by which its standard deviations are multiplied; the other figures stay.
@@ -110,9 +116,8 @@ def bound_mm(report: FitReport, name: str, share: float = 1.0) -> float | None:
         known[std] += math.log(share)
     quantile = shipped().tumor if name in report.tumors else shipped().organ
     learned_mm = quantile.bound_mm(known)
-    return max(
-        math.hypot(learned_mm, depths_within_mm(report, name)), alternatives_mm(report, name)
-    )
+    beside_mm = depths_within_mm(report, name), probes_within_mm(report)
+    return max(math.hypot(learned_mm, *beside_mm), alternatives_mm(report, name))
 
 
 def alternatives_mm(report: FitReport, name: str) -> float:

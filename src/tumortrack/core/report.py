@@ -212,7 +212,8 @@ class EvidenceReport(_Value, frozen=True, kw_only=True):
 
 class ProbeReport(_Value, frozen=True, kw_only=True):
     """What is wrong in all images of a tracked probe (``core.ultrasound.ImageErrors``), with
-    standard deviations."""
+    standard deviations. ``shift_std_mm``: by what that leaves open the answer may be shifted, along
+    the worst axis; 0 where a camera saw the organ."""
 
     tool: str
     places: int
@@ -223,6 +224,7 @@ class ProbeReport(_Value, frozen=True, kw_only=True):
     depth_std: float
     width: float
     width_std: float
+    shift_std_mm: float = 0.0
 
     @property
     def undetermined(self) -> tuple[str, ...]:

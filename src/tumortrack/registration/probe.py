@@ -14,6 +14,7 @@ the deviations of its places (``believed``): the pose must not take it up.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,7 +47,19 @@ class FoundErrors:
     covariance: Float64[np.ndarray, "3 3"]
     cost: float
 
-    def report(self, recording: ProbeRecording) -> ProbeReport:
+    def left_open_mm(self, recording: ProbeRecording) -> tuple[float, float]:
+        """Standard deviations that they leave: of all places alike, along the worst axis, and of
+        each beside that, along any."""
+        _, by_errors = _places(recording, self.errors)
+        by_errors = by_errors[np.isfinite(by_errors).all((1, 2))]
+        mean = by_errors.mean(0)
+        away = by_errors - mean
+        alike_mm2 = np.linalg.eigvalsh(mean @ self.covariance @ mean.T)[-1]
+        own_mm2 = np.einsum("nke,ef,nkf->n", away, self.covariance, away).mean() / 3
+        return float(np.sqrt(alike_mm2)), float(np.sqrt(own_mm2))
+
+    def report(self, recording: ProbeRecording, alone: bool) -> ProbeReport:
+        """``alone``: no camera saw the organ, so that what all places share shifts the answer."""
         lag, depth, width = np.sqrt(np.diag(self.covariance)).tolist()
         return ProbeReport(
             tool=recording.tool,
@@ -58,6 +71,7 @@ class FoundErrors:
             depth_std=depth,
             width=self.errors.width,
             width_std=width,
+            shift_std_mm=self.left_open_mm(recording)[0] if alone else 0.0,
         )
 
 
@@ -67,15 +81,10 @@ UNKNOWN = FoundErrors(NO_ERRORS, np.diag(PRIOR_STD**2), 0.0)
 def believed(recording: ProbeRecording, found: FoundErrors) -> ProbeRecording:
     """With the deviations that errors leave which are known so well: what they do to all places
     alike is shared, the rest is each one's."""
-    _, by_errors = _places(recording, found.errors)
-    by_errors = by_errors[np.isfinite(by_errors).all((1, 2))]
-    mean = by_errors.mean(0)
-    alike_mm2 = np.linalg.eigvalsh(mean @ found.covariance @ mean.T)[-1]  # along the worst axis
-    away = by_errors - mean
-    own_mm2 = np.einsum("nke,ef,nkf->n", away, found.covariance, away).mean() / 3
-    std_mm = np.sqrt([recording.std_mm**2 + own_mm2, recording.shared_std_mm**2 + alike_mm2])
-    own, shared = np.minimum(std_mm, _LARGEST_MM).tolist()
-    return replace(recording, std_mm=own, shared_std_mm=shared)
+    alike_mm, own_mm = found.left_open_mm(recording)
+    own_mm = min(math.hypot(recording.std_mm, own_mm), _LARGEST_MM)
+    shared_mm = min(math.hypot(recording.shared_std_mm, alike_mm), _LARGEST_MM)
+    return replace(recording, std_mm=own_mm, shared_std_mm=shared_mm)
 
 
 def find_errors(

@@ -168,12 +168,12 @@ class Tracker:
             most = (MOST_PLACES - sum(len(each.places) for each in known)) // len(recordings)
             thinned = recording.thinned(max(most, FEWEST_TOUCHES))
             views, others, cloud = all_views, known, all_views[0].cloud
-            if not len(cloud.points_mm):
+            if alone := not len(cloud.points_mm):
                 outlines = believed(thinned, UNKNOWN).outlines()
                 views, _, others = _alone(cloud, (*known, *outlines), self.model.parts[0])
             found = locator.errors_of(thinned, views, seed, others, any_pose)
             pieces += believed(thinned, found).outlines(found.errors)
-            reports.append(found.report(thinned))
+            reports.append(found.report(thinned, alone))
         return pieces, tuple(reports)
 
     def follow(
