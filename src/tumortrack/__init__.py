@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from tumortrack.core.types import Intrinsics as Intrinsics
     from tumortrack.core.types import SensorCloud as SensorCloud
     from tumortrack.core.types import View as View
+    from tumortrack.core.ultrasound import ProbeRecording as ProbeRecording
     from tumortrack.io.case import Case as Case
     from tumortrack.io.case import load_case as load_case
     from tumortrack.report.inspection import describe as describe
@@ -38,12 +39,13 @@ if TYPE_CHECKING:
 
 _NAMES = {  # by the module that has them
     "api": "estimate_from_surfaces evaluate export find_organ load_estimate load_model locate "
-    "locate_files prepare read_cloud read_depth scan_phantom simulate_scenes "
+    "locate_files prepare read_cloud read_depth read_ultrasound scan_phantom simulate_scenes "
     "track train train_tissue_classifier write_scenes",
     "core": "errors",
     "core.estimate": "Estimate",
     "core.evidence": "FreeSpace Grasp Landmark Outline Touch",
     "core.types": "DepthFrame Intrinsics View SensorCloud",
+    "core.ultrasound": "ProbeRecording",
     "io.case": "Case load_case",
     "report.inspection": "describe",
     "report.results": "Evaluation TrackSummary",

@@ -30,6 +30,7 @@ from tumortrack.tracking.keywords import (
     ExportKeywords,
     LocateKeywords,
     PrepareKeywords,
+    RecordingKeywords,
     SessionKeywords,
     SimulateKeywords,
     StrPath,
@@ -45,6 +46,7 @@ from tumortrack.tracking.options import (
 )
 
 if TYPE_CHECKING:
+    from tumortrack.core.ultrasound import ProbeRecording
     from tumortrack.io.scene_folder import Scene
     from tumortrack.live.cameras import CameraSetup
     from tumortrack.live.session import Session
@@ -339,6 +341,25 @@ def read_depth(path: StrPath, intrinsics: StrPath, unit_mm: float | None = None)
     from tumortrack.io import depth_files as files
 
     return files.read_depth(Path(path), Path(intrinsics), unit_mm)[0]
+
+
+def read_ultrasound(
+    path: StrPath,
+    parts: Sequence[str] = ("kidney", "tumor_1"),
+    **options: Unpack[RecordingKeywords],
+) -> ProbeRecording:
+    """Borders of parts in a tracked probe's images, and its poses: ``evidence`` of ``locate``.
+    Raises InputError: a file is missing or damaged, a transform is missing, no mask has a pose.
+
+    Args:
+        path: a sequence (.mha, .mhd, .nrrd), or with ``poses`` a folder or pattern of masks.
+        parts: names of labels 1 (the organ), 2, ...: ``case.anatomy.names``.
+        options: as of ``io.ultrasound_files.RecordingOptions``.
+    """
+    from tumortrack.io.ultrasound_files import RecordingOptions, read_recording
+
+    asked = options_from(RecordingOptions, {**options}, "read_ultrasound")
+    return read_recording(Path(path), parts, asked)
 
 
 def find_organ(

@@ -7,6 +7,7 @@ import pytest
 import tumortrack as tt
 from refused import refused
 from tumortrack.case.options import PrepareOptions
+from tumortrack.io.ultrasound_files import RecordingOptions
 from tumortrack.tracking import keywords
 from tumortrack.tracking.options import (
     ExportOptions,
@@ -23,6 +24,7 @@ from tumortrack.tracking.options import (
         (keywords.SimulateKeywords, SimulateOptions),
         (keywords.ExportKeywords, ExportOptions),
         (keywords.LocateKeywords, LocateOptions),
+        (keywords.RecordingKeywords, RecordingOptions),
         (keywords.SessionKeywords, TrackOptions),
     ],
 )

@@ -42,6 +42,7 @@ SIGNATURES = {
     "prepare": "source folder=None overwrite=False segment=None progress=None options",
     "read_cloud": "path unit='mm'",
     "read_depth": "path intrinsics unit_mm=None",
+    "read_ultrasound": "path parts=('kidney', 'tumor_1') options",
     "scan_phantom": "folder seed=1 spacing_mm=(1.2, 1.2, 1.5)",
     "simulate_scenes": "case count=1 seed=0 elastic=True noise=True",
     "train_tissue_classifier": "frame picture organ beside",
@@ -62,7 +63,7 @@ OTHERS = {
         "Intrinsics",
         "Landmark",
     ),
-    *("View", "Outline", "SensorCloud", "Touch", "TrackSummary", "Tracker"),
+    *("View", "Outline", "ProbeRecording", "SensorCloud", "Touch", "TrackSummary", "Tracker"),
     *("datasets", "errors", "presets"),
 }
 

@@ -9,6 +9,7 @@ import json
 import resource
 import shutil
 import struct
+import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -160,6 +161,42 @@ KIT = {
 }
 
 
+# Three frames of a tracked probe: labels of 16 x 12 pixels.
+SCAN_KEYS = {
+    "ImageToProbeTransform": "2 0 0 0 0 2 0 0 0 0 2 0 0 0 0 1",
+    "UltrasoundImageOrientation": "UF",
+    **{
+        f"Seq_Frame000{n}_{name}": value
+        for n in range(3)
+        for name, value in {
+            "ProbeToTrackerTransform": f"1 0 0 {n} 0 1 0 0 0 0 1 90 0 0 0 1",
+            "ProbeToTrackerTransformStatus": "OK",
+            "Timestamp": f"10.{n}",
+        }.items()
+    },
+}
+SCAN_LABELS = np.zeros((3, 12, 16), np.uint8)
+SCAN_LABELS[:, 3:9, 4:12] = 1
+PIXELS = SCAN_LABELS.tobytes()
+SCAN_NRRD = (
+    "NRRD0005\ntype: uint8\ndimension: 3\nsizes: 16 12 3\nkinds: domain domain list\n"
+    "encoding: gzip\n" + "".join(f"{key}:={value}\n" for key, value in SCAN_KEYS.items()) + "\n"
+).encode() + gzip.compress(PIXELS, mtime=0)
+
+
+def scan(compressed: bool) -> bytes:
+    fields = {
+        "ObjectType": "Image",
+        "DimSize": "16 12 3",
+        "CompressedData": str(compressed),
+        **SCAN_KEYS,
+        "ElementType": "MET_UCHAR",
+        "ElementDataFile": "LOCAL",
+    }
+    head = "".join(f"{key} = {value}\n" for key, value in fields.items()).encode()
+    return head + (zlib.compress(PIXELS) if compressed else PIXELS)
+
+
 def read_beside(path: Path) -> object:
     """As an organ's mesh: repaired where it can be."""
     return read_meshes([path])
@@ -205,6 +242,8 @@ FILES: dict[str, tuple[Any, tuple[object, ...]]] = {
         ),
     ),
     "calibration.yaml": ("tumortrack.live.calibration_file:read_frames", (EASY_HANDEYE,)),
+    "scan.mha": ("tumortrack.api:read_ultrasound", (scan(True), scan(False))),
+    "scan.nrrd": ("tumortrack.api:read_ultrasound", (SCAN_NRRD,)),
     "poses.csv": ("tumortrack.live.poses:FilePoses", (TOOL_TABLE,)),
     "kit.json": ("tumortrack_experiment.kit_file:read_kit", (KIT,)),
     "lens.json": (

@@ -42,7 +42,7 @@ class Locate(LocateOptions):
     Attributes:
         model: a case, or a folder that `train` wrote.
         cloud: .ply, .pcd or .npz in the camera frame, or a depth image (with --intrinsics): 16-bit
-            PNG or TIFF, or a TIFF of floats; or -: none, but touches (--evidence).
+            PNG or TIFF, or a TIFF of floats; or -: none, but touches or outlines (--evidence).
         more: further views of an organ that does not move in between; they need --poses, and the
             answer is in the first one's frame.
         out: folder to write.
@@ -55,6 +55,7 @@ class Locate(LocateOptions):
     more: Positional[tuple[Path, ...]] = ()
     out: Path | None = None
     intrinsics: UseAppendAction[tuple[Path, ...]] = ()
+    evidence: UseAppendAction[tuple[Path, ...]] = ()
     json: bool = False
     overwrite: bool = False
 
@@ -121,4 +122,4 @@ def _say_written(estimate: Estimate, located: Located, out: Path) -> None:
         count, file = len(located.points.points_ct), out / "points.csv"
         say(f"{count} points of the CT: their places are in {file}")
     seconds = estimate.report.timings["total"]
-    say(f"written to {out} (camera frame, mm) in {seconds:.2f} s; look at {out / PAGE}.")
+    say(f"written to {out} ({estimate.frame} frame, mm) in {seconds:.2f} s; look at {out / PAGE}.")

@@ -77,7 +77,8 @@ class ProbeRecording:
         stamps_s, known = stamps_s - errors.lag_s, self.stamps_s
         after = np.clip(np.searchsorted(known, stamps_s), 1, len(known) - 1)
         gap_s = known[after] - known[after - 1]
-        inside = (stamps_s >= known[0]) & (stamps_s <= known[-1]) & (gap_s <= _LONGEST_GAP_S)
+        near = (gap_s <= _LONGEST_GAP_S) | np.isin(stamps_s, known)
+        inside = (stamps_s >= known[0]) & (stamps_s <= known[-1]) & near
         from scipy.spatial.transform import Rotation, Slerp  # slow to import
 
         at_s = np.clip(stamps_s, known[0], known[-1])
@@ -158,11 +159,13 @@ def border_px(
 ) -> Float64[np.ndarray, "n 2"]:
     """Where a part's region ends in an image: (column, row) halfway between two pixels. It does not
     end where the image does, nor at the edge of the ``field`` that the probe sees."""
-    seen = np.ones(inside.shape, bool) if field is None else field
-    across = (inside[:, 1:] != inside[:, :-1]) & seen[:, 1:] & seen[:, :-1]
-    down = (inside[1:] != inside[:-1]) & seen[1:] & seen[:-1]
-    rows, columns = np.nonzero(across)
-    lower_rows, lower_columns = np.nonzero(down)
+    across, down = inside[:, 1:] != inside[:, :-1], inside[1:] != inside[:-1]
+    if field is not None:
+        across &= field[:, 1:] & field[:, :-1]
+        down &= field[1:] & field[:-1]
+    # Many times as fast as np.nonzero of two axes.
+    rows, columns = np.divmod(np.flatnonzero(across), max(across.shape[1], 1))
+    lower_rows, lower_columns = np.divmod(np.flatnonzero(down), max(down.shape[1], 1))
     return np.concatenate(
         [
             np.column_stack([columns + 0.5, rows]),
@@ -175,14 +178,16 @@ def spread_px(
     places_px: Float64[np.ndarray, "n 2"], mm_per_pixel: tuple[float, float]
 ) -> Float64[np.ndarray, "m 2"]:
     """One place for each ``APART_MM``: that nearest to the mean of those about it."""
+    if not len(places_px):
+        return places_px
     cells = np.floor(places_px * mm_per_pixel / APART_MM).astype(int)
-    _, cell = np.unique(cells, axis=0, return_inverse=True)
-    cell = cell.ravel()
-    count = np.bincount(cell)
+    across, down = (cells - cells.min(0)).T
+    cell = across * (down.max() + 1) + down
+    count = np.maximum(np.bincount(cell), 1)
     means = np.column_stack([np.bincount(cell, places_px[:, k]) / count for k in (0, 1)])
     away = ((places_px - means[cell]) ** 2).sum(1)
     order = np.lexsort([away, cell])
-    return places_px[order[np.r_[True, np.diff(cell[order]) > 0]]] if len(order) else places_px
+    return places_px[order[np.r_[True, np.diff(cell[order]) > 0]]]
 
 
 def part_borders_px(
@@ -194,8 +199,8 @@ def part_borders_px(
     """Of an image of labels, by part: the ``parts`` of the labels that are there. The organ, the
     part of label 1, is what any label covers: a tumor's border inside it is none of the organ's."""
     found = {}
-    for label in np.intersect1d(np.unique(labels), list(parts)).tolist():
-        inside = labels > 0 if label == 1 else labels == label
-        if len(places := border_px(inside, field)):
-            found[parts[label]] = spread_px(places, mm_per_pixel)
+    for label, name in sorted(parts.items()):
+        same = labels == label
+        if same.any() and len(places := border_px(labels > 0 if label == 1 else same, field)):
+            found[name] = spread_px(places, mm_per_pixel)
     return found

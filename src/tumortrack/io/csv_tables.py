@@ -8,14 +8,21 @@ import io
 import re
 from collections.abc import Callable, Sequence
 from decimal import Decimal, InvalidOperation
+from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import rigid
+from tumortrack.core.store import read_file
 
 T = TypeVar("T")
+COLUMNS = "stamp_ns,frame_id,x_mm,y_mm,z_mm,qw,qx,qy,qz"
+CONTACT = ",contact"  # one more, of a tool: 1 while its tip touches, else 0
+_NOT_UNIT = 1e-3  # tolerance of a quaternion's length: files have few digits
+_LARGEST_TABLE = 256 * 2**20  # bytes
 _ABOVE = re.compile(r"((#.*|sep=.)?\r?\n)*")  # Excel states its separator so
 _DECIMAL = re.compile(r"^(-?\d*),(\d+)$")
 _UTF16 = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
@@ -123,3 +130,39 @@ def whole_in(text: str, where: str) -> int:
     except InvalidOperation:
         pass
     raise InputError(f"{where}: {text[:40]!r} is no whole number, or beyond 63 bits.")
+
+
+class PoseTable(NamedTuple):
+    """Rising stamps, of each one pose in the frame ``frame_id``, mm, and, where the table says it,
+    whether a tip touches."""
+
+    frame_id: str
+    stamps_ns: Int64[np.ndarray, " n"]
+    poses: Float64[np.ndarray, "n 4 4"]
+    touches: list[bool]
+
+
+def read_pose_table(path: Path) -> PoseTable:
+    """A table of stamped poses (docs/conventions.md). Raises InputError: there is none, or it is
+    damaged."""
+    names, contact = COLUMNS.split(","), CONTACT[1:]
+    table = read_rows(read_file(path, _LARGEST_TABLE), str(path), names, [contact])
+    stamps_ns = np.array(table.column("stamp_ns", whole_in), np.int64)
+    frames = set(table.column("frame_id", lambda text, _: text))
+    numbers = table.numbers(names[2:])
+    touches = table.numbers([contact] if contact in table.columns else [])
+    lengths = np.linalg.norm(numbers[:, 3:], axis=1)
+    faults = {
+        "contact must be 0 or 1": np.isin(touches, (0, 1)).all(),
+        "stamps must rise": (np.diff(stamps_ns) > 0).all(),
+        "frame_id must be one name, in every row": len(frames) == 1 and "" not in frames,
+        "places must be finite": np.isfinite(numbers).all(),
+        "qw, qx, qy, qz must have length 1": (np.abs(lengths - 1) < _NOT_UNIT).all(),
+    }
+    if wrong := [what for what, met in faults.items() if not met]:
+        raise InputError(f"{path} is not a table of poses: {wrong[0]}.")
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    turns = Rotation.from_quat(numbers[:, 3:], scalar_first=True).as_matrix()
+    poses = np.array([*map(rigid, turns, numbers[:, :3])])
+    return PoseTable(frames.pop(), stamps_ns, poses, (touches.ravel() == 1).tolist())

@@ -32,7 +32,7 @@ _MAX_HEADER = 2**20
 _SEGMENT = re.compile(r"segment(\d+)_(id)?", re.IGNORECASE)
 _IS_GZIP = {"raw": False, "gzip": True, "gz": True}
 _NAMES = read_table("tumortrack.io", "nrrd_types.toml", dict[str, list[str]])
-_TYPES = {name: dtype for dtype, names in _NAMES.items() for name in names}
+NRRD_TYPES = {name: dtype for dtype, names in _NAMES.items() for name in names}
 _LPS_FROM_SPACE = {
     **dict.fromkeys(("lps", "left-posterior-superior"), (1.0, 1.0, 1.0)),
     **dict.fromkeys(("ras", "right-anterior-superior"), (-1.0, -1.0, 1.0)),
@@ -188,7 +188,7 @@ def is_label_map(raw: grid.RawVolume, most: int = MOST_LABELS) -> bool:
 
 def _read_nrrd(path: Path) -> grid.RawVolume:
     """Read an attached .nrrd (raw or gzip) with a stated patient space."""
-    fields, start = _header(path)
+    fields, _, start = nrrd_header(path)
     encoding = fields.get("encoding", "raw").lower()
     if (compressed := _IS_GZIP.get(encoding)) is None:
         raise InputError(f"{path}: encoding {encoding!r} is not read. Export as raw or gzip.")
@@ -196,7 +196,7 @@ def _read_nrrd(path: Path) -> grid.RawVolume:
         layers, shape = 1, tuple(int(n) for n in fields["sizes"].split())
         if len(shape) == 4 and "segment0_id" in fields:  # the first axis holds layers
             layers, shape = shape[0], shape[1:]
-        dtype = np.dtype(_TYPES[fields["type"].lower()])
+        dtype = np.dtype(NRRD_TYPES[fields["type"].lower()])
         lps_from_index = _lps_from_index(path, fields) if len(shape) == 3 else np.eye(4)
     grid.check_size(path, shape, layers * dtype.itemsize, compressed)
     grid.check_affine(path, lps_from_index)
@@ -244,24 +244,30 @@ def _segments(path: Path, fields: dict[str, str], layers: np.ndarray) -> tuple[g
     )
 
 
-def _header(path: Path) -> tuple[dict[str, str], int]:
-    """The fields up to the empty line, and the byte where the voxels start."""
+def nrrd_header(
+    path: Path, most_bytes: int = _MAX_HEADER
+) -> tuple[dict[str, str], dict[str, str], int]:
+    """The fields up to the empty line, their names in lower case; keys with their values, those of
+    segments among the fields as well; and the byte where the voxels start."""
     with path.open("rb") as stream:
-        head = stream.read(_MAX_HEADER)
+        head = stream.read(most_bytes)
     if not head.startswith(b"NRRD000"):
         raise InputError(f"{path} is not a NRRD file. Export it again.")
     gap = re.search(rb"\r?\n\r?\n", head)
     lines = head[: gap.start() if gap else None].decode("latin-1").replace("\r\n", "\n").split("\n")
-    fields: dict[str, str] = {}
-    for line in lines[1:]:
-        if not line.startswith("#") and (":=" not in line or _SEGMENT.match(line)):
-            name, _, value = line.partition(":")
-            fields[name.strip().lower()] = value.lstrip("=").strip()
+    fields, keys = dict[str, str](), dict[str, str]()
+    for line in (line for line in lines[1:] if not line.startswith("#")):
+        name, _, value = line.partition(":")
+        if ":=" in line:
+            name, _, value = line.partition(":=")
+            keys[name.strip()] = value.strip()
+        if ":=" not in line or _SEGMENT.match(line):
+            fields[name.strip().lower()] = value.strip()
     if gap is None or "data file" in fields or "datafile" in fields:
         raise InputError(f"{path}: its voxels lie in another file. Export one attached .nrrd file.")
     if any(fields.get(name, "0") != "0" for name in ("line skip", "byte skip", "lineskip")):
         raise InputError(f"{path}: skipped lines or bytes are not read. Export it again.")
-    return fields, gap.end()
+    return fields, keys, gap.end()
 
 
 def _lps_from_index(path: Path, fields: dict[str, str]) -> np.ndarray:

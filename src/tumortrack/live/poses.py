@@ -8,14 +8,13 @@ from bisect import bisect_left
 from pathlib import Path
 from typing import ClassVar
 
-import numpy as np
-
 from tumortrack.core.config import Config
-from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import IDENTITY, Affine, rigid
 from tumortrack.core.report import Finding
-from tumortrack.core.store import read_file
-from tumortrack.io.csv_tables import read_rows, whole_in
+from tumortrack.io.csv_tables import COLUMNS as COLUMNS
+from tumortrack.io.csv_tables import CONTACT as CONTACT
+from tumortrack.io.csv_tables import read_pose_table
 from tumortrack.live.values import Observation
 
 # Between two poses an arm that accelerates by 1 m/s2 deviates from linear interpolation by at most
@@ -23,10 +22,6 @@ from tumortrack.live.values import Observation
 _GAP_NS = 100_000_000
 _BACK_NS = 1_000_000_000
 _KEPT = 2000  # poses of a live source: 4 s at 500 Hz
-_NOT_UNIT = 1e-3  # tolerance of a quaternion's length: files have few digits
-_LARGEST_TABLE = 256 * 2**20  # bytes
-COLUMNS = "stamp_ns,frame_id,x_mm,y_mm,z_mm,qw,qx,qy,qz"
-CONTACT = ",contact"  # one more, of a tool: 1 while its tip touches, else 0
 
 
 class CameraPoses:
@@ -122,30 +117,12 @@ class FilePoses(CameraPoses):
     InputError: there is no such table, or it is damaged."""
 
     def __init__(self, path: Path) -> None:
-        names, contact = COLUMNS.split(","), CONTACT[1:]
-        table = read_rows(read_file(path, _LARGEST_TABLE), str(path), names, [contact])
-        stamps_ns = np.array(table.column("stamp_ns", whole_in), np.int64)
-        frames = set(table.column("frame_id", lambda text, _: text))
-        numbers = table.numbers(names[2:])
-        touches = table.numbers([contact] if contact in table.columns else [])
-        lengths = np.linalg.norm(numbers[:, 3:], axis=1)
-        faults = {
-            "contact must be 0 or 1": np.isin(touches, (0, 1)).all(),
-            "stamps must rise": (np.diff(stamps_ns) > 0).all(),
-            "frame_id must be one name, in every row": len(frames) == 1 and "" not in frames,
-            "places must be finite": np.isfinite(numbers).all(),
-            "qw, qx, qy, qz must have length 1": (np.abs(lengths - 1) < _NOT_UNIT).all(),
-        }
-        if wrong := [what for what, met in faults.items() if not met]:
-            raise InputError(f"{path} is not a table of poses: {wrong[0]}.")
-        (self.frame_id,), self.poses = frames, PoseBuffer()
-        from scipy.spatial.transform import Rotation
-
-        turns = Rotation.from_quat(numbers[:, 3:], scalar_first=True).as_matrix()
-        for stamp_ns, turn, shift in zip(stamps_ns.tolist(), turns, numbers[:, :3], strict=True):
-            self.poses.add(stamp_ns, rigid(turn, shift), len(stamps_ns))
-        said = (touches.ravel() == 1).tolist()  # nothing without that column
-        self.touches = list(zip(stamps_ns.tolist(), said, strict=False))
+        table = read_pose_table(path)
+        self.frame_id, self.poses = table.frame_id, PoseBuffer()
+        stamps_ns = table.stamps_ns.tolist()
+        for stamp_ns, pose in zip(stamps_ns, table.poses, strict=True):
+            self.poses.add(stamp_ns, pose, len(stamps_ns))
+        self.touches = list(zip(stamps_ns, table.touches, strict=False))
 
     def pose(self, seen: Observation) -> Affine:
         return self.poses.at(seen.stamp_ns)

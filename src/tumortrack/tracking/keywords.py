@@ -63,6 +63,17 @@ class ExportKeywords(TypedDict, total=False):
     patient: str | None
 
 
+class RecordingKeywords(TypedDict, total=False):
+    """See ``io.ultrasound_files.RecordingOptions``."""
+
+    masks: StrPath | None
+    mask_part: str
+    poses: StrPath | None
+    mm_per_pixel: tuple[float, ...]
+    image_to_probe: StrPath | None
+    frame: str
+
+
 class _RegionKeywords(TypedDict, total=False):
     patient: str | None
     side: Side
@@ -85,7 +96,12 @@ class LocateKeywords(_RegionKeywords, total=False):
     unit: Literal["mm", "m"]
     depth_unit: float | None
     intrinsics: StrPath | Sequence[StrPath]
-    evidence: StrPath | None
+    evidence: StrPath | Sequence[StrPath] | None
+    frame: StrPath | None
+    masks: StrPath | None
+    mask_part: str
+    mm_per_pixel: tuple[float, ...]
+    image_to_probe: StrPath | None
     map: StrPath | None
     case: StrPath | None
 

@@ -90,7 +90,8 @@ class LocateOptions(RegionOptions):
 
     Attributes:
         poses: JSON with fixed_from_camera (4 x 4 rows for each view, in their order), unit (mm or
-            m) and frame_id: where the camera was, for example in a robot's base frame.
+            m) and frame_id: where the camera was, for example in a robot's base frame. A .csv is of
+            the ultrasound probe instead: a pose for each mask.
         at: COLUMN ROW of a pixel of the depth image that shows the organ, from 0 at the upper left.
         mask: image of the depth image's size, 0 outside the organ.
         grid: voxels along the longest side of the labelled volume, up to 400.
@@ -101,7 +102,16 @@ class LocateOptions(RegionOptions):
         intrinsics: JSON with width, height, fx, fy, cx, cy in pixels: once for all views, or once
             for each, in their order.
         evidence: JSON or CSV with what else is known of where the organ lies: touched points,
-            landmarks, outlines (docs/evidence.md). Needs a model of preset elastic.
+            landmarks, outlines (docs/evidence.md); or tracked ultrasound: a sequence (.mha, .mhd,
+            .nrrd), or with --poses TABLE.csv a folder or pattern of masks. Repeatable. Needs a
+            model of preset elastic.
+        frame: of ultrasound: JSON file with the camera's pose in the frame of the probe's poses, as
+            for `track`.
+        masks: of a sequence's frames: a folder or pattern of images, a segmentation or sequence.
+        mask_part: the part that all masks show (tumor_1); else their values say it.
+        mm_per_pixel: of ultrasound: a pixel's width, and its height where that differs.
+        image_to_probe: of ultrasound: JSON with probe_from_image (4 x 4 rows) and unit, or a PLUS
+            configuration (.xml).
         advise: part for which it says what to learn next (default: the tumor that is least sure).
         map: points of the CT to map to the camera frame (OUT/points.csv): a .csv with columns
             x,y,z (LPS, mm), or 3D Slicer's .mrk.json or .fcsv. Needs a model of preset elastic.
@@ -118,7 +128,12 @@ class LocateOptions(RegionOptions):
     unit: Literal["mm", "m"] = "mm"
     depth_unit: float | None = None
     intrinsics: tuple[Path, ...] = ()
-    evidence: Path | None = None
+    evidence: tuple[Path, ...] = ()
+    frame: Path | None = None
+    masks: Path | None = None
+    mask_part: str = ""
+    mm_per_pixel: tuple[float, ...] = ()
+    image_to_probe: Path | None = None
     advise: str = ""
     map: Path | None = None
     case: Path | None = None
@@ -282,7 +297,7 @@ def options_from(kind: type[_Options], given: dict[str, Any], what: str) -> _Opt
         raise InputError(f"{what} knows no {unknown[0]!r}; allowed: {', '.join(hints)}.")
     for name, value in given.items():
         if hints[name] == tuple[Path, ...]:
-            paths = [value] if isinstance(value, str | Path) else value
+            paths = [value] if isinstance(value, str | Path) else value or ()
             given[name] = tuple(map(Path, paths))
         elif hints[name] == Path | None and value is not None:
             given[name] = Path(value)

@@ -177,7 +177,7 @@ def read_views(paths: Sequence[Path], options: LocateOptions) -> list[ViewFile]:
 
 def _read_view(path: Path, intrinsics: Path | None, options: LocateOptions) -> ViewFile:
     if path == NO_CLOUD:
-        if options.evidence is None:
+        if not options.evidence:
             raise InputError("without a cloud (-) give --evidence FILE with touches or outlines.")
         return ViewFile(path, SensorCloud(np.zeros((0, 3), np.float32)))
     suffix = path.suffix.lower()
@@ -201,8 +201,9 @@ def _read_view(path: Path, intrinsics: Path | None, options: LocateOptions) -> V
 
 
 def read_places(poses: Path | None, views: int) -> tuple[str, tuple[Affine, ...]]:
-    """The fixed frame's name, and fixed_from_camera of each view; empty for a single view."""
-    if poses is None and views == 1:
+    """The fixed frame's name, and fixed_from_camera of each view; empty for a single view, whose
+    table of poses is of a probe."""
+    if views == 1 and (poses is None or poses.suffix.lower() == ".csv"):
         return "", ()
     if poses is None or views == 1:
         raise InputError("give --poses FILE with several views, and only with several.")
