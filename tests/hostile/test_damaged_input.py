@@ -359,8 +359,8 @@ def test_openigtlink(times):
         """The first byte says what it is of."""
         unpack = (
             *(igtl.unpack_transform, igtl.unpack_string),
-            *(igtl.unpack_points, igtl.unpack_polydata_points),
-        )[data[0] % 4 if data else 0]
+            *(igtl.unpack_points, igtl.unpack_polydata_points, igtl.unpack_labels),
+        )[data[0] % 5 if data else 0]
         content, _ = igtl.unpack_body(igtl.Header(2, "X", "x", 0, len(data) - 1, 0), data[1:])
         unpack(content)
 
@@ -369,6 +369,8 @@ def test_openigtlink(times):
         b"\0\3\0\1" + b"1",
         igtl.pack_points(np.ones((2, 3)), ["a", "b"], [(1, 2, 3)] * 2),
         igtl.pack_polydata(np.ones((3, 3)), np.array([[0, 1, 2]])),
+        struct.pack("> H 4B 3H 12f 6H", 1, 1, 3, 2, 1, 3, 2, 1, *range(12), 0, 0, 0, 3, 2, 1)
+        + bytes([0, 1, 2] * 2),
     )
     bodies = [
         bytes([n]) + igtl.pack(igtl.Message("X", "x", 1, content, {"k": "v"}))[igtl.HEADER_SIZE :]

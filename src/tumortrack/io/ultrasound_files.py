@@ -219,6 +219,15 @@ def _poses(name: str, frames: Sequence[dict[str, str]]) -> Float64[np.ndarray, "
     return poses
 
 
+def read_image_to_probe(path: Path) -> Affine:
+    """The probe's frame, mm, from the image's: JSON (``ImageCalibration``) or a PLUS configuration.
+    Raises InputError: there is none, or several."""
+    found = [each for (start, _), each in _calibration(path).items() if start == _IMAGE]
+    if len(found) != 1:
+        raise InputError(f"{path} has {len(found)} transforms from {_IMAGE}; it must have one.")
+    return found[0]
+
+
 def _matrix(given: str | Iterable[Iterable[float]], where: str) -> Affine:
     """Raises InputError: it is no affine transform that can be inverted."""
     with readable(where, "is no matrix of 16 numbers"):

@@ -19,7 +19,7 @@ from tumortrack_devices.igtl.message import Header, Message, ProtocolError, pack
 from tumortrack_devices.network import Pace
 
 _LARGEST_REQUEST = 2**16  # bytes
-_LARGEST_HEARD = 2**22  # bytes: a surface of 100,000 points
+_LARGEST_HEARD = 2**24  # bytes: an image of 4,000 x 4,000 labels, a surface of 400,000 points
 _LARGEST_SKIPPED = 2**30  # an image or volume beside what is heard
 MOST_RECEIVERS = 16  # further ones are refused: each may hold half a megabyte
 _REQUESTS_PER_S = 100.0
@@ -158,7 +158,8 @@ class Link:
         while True:
             await asyncio.sleep(pace.wait_s())
             header = igtl.unpack_header(await reader.readexactly(igtl.HEADER_SIZE))
-            if self._heard and largest < header.body_size <= _LARGEST_SKIPPED:
+            most = largest if header.type in self._wanted else _LARGEST_REQUEST
+            if self._heard and most < header.body_size <= _LARGEST_SKIPPED:
                 for left in range(header.body_size, 0, -_PIECE):
                     await reader.readexactly(min(left, _PIECE))
                 if header.type in self._wanted:

@@ -4,7 +4,7 @@ Header version 2 (protocol 3), which 3D Slicer (since 4.7), PLUS and pyigtl read
 metadata for frames and missing transforms. Headers of version 1 are read too, since clients use it
 for requests. All numbers are big-endian.
 Source: the protocol's Documents/Protocol: header.md, timestamp.md, transform.md, status.md,
-polydata.md, point.md, string.md.
+polydata.md, point.md, string.md, image.md.
 """
 
 from __future__ import annotations
@@ -34,6 +34,8 @@ _POLYDATA = struct.Struct("> 10I")
 _ATTRIBUTE = struct.Struct("> B B I")
 _POINT_SCALARS = 0x00
 _POINT = struct.Struct("> 64s 32s 4B 4f 20s")
+_IMAGE = struct.Struct("> H 4B 3H 12f 6H")
+_INTEGERS = {2: "i1", 3: "u1", 4: "i2", 5: "u2", 6: "i4", 7: "u4"}  # by the protocol's number
 _NOT_RIGID = 1e-3  # deviation of a rotation from orthonormal: float32 of some trackers' matrices
 _NO_SEGMENTS = np.zeros((0, 2), np.int32)
 
@@ -52,6 +54,15 @@ class Message(NamedTuple):
     stamp_ns: int = 0
     content: bytes = b""
     metadata: Mapping[str, str] = {}
+
+
+class Labels(NamedTuple):
+    """One slice of an IMAGE. ``labels``: rows and columns; ``sent_from_pixel``: (column, row, 0) ->
+    mm, in the axes in which the IMAGE was sent; ``lps``: whether it says that they are LPS."""
+
+    labels: Int[np.ndarray, "h w"]
+    sent_from_pixel: Float[np.ndarray, "4 4"]
+    lps: bool
 
 
 class Header(NamedTuple):
@@ -178,6 +189,32 @@ def unpack_polydata_points(content: bytes) -> Float[np.ndarray, "n 3"]:
     if not np.isfinite(points).all():
         raise ProtocolError("a POLYDATA is not finite.")
     return points
+
+
+def unpack_labels(content: bytes) -> Labels:
+    """An IMAGE of whole numbers, one slice, or what is sent of it (its subvolume). The header says
+    where the whole image's middle is. Raises ProtocolError: it is another one, or of another size
+    than it says."""
+    if len(content) < _IMAGE.size:
+        raise ProtocolError("an IMAGE is cut off.")
+    _, components, kind, endian, coordinates, *numbers = _IMAGE.unpack_from(content)
+    axes, middle = np.array(numbers[3:12]).reshape(3, 3).T, np.array(numbers[12:15])
+    size, first, shape = (np.array(numbers[at : at + 3]) for at in (0, 15, 18))
+    columns, rows, slices = shape.tolist()
+    form = np.dtype(_INTEGERS.get(kind, "u1")).newbyteorder(">" if endian == 1 else "<")
+    labels = kind in _INTEGERS and components == slices == 1 and min(columns, rows) > 1
+    whole = len(content) == _IMAGE.size + rows * columns * form.itemsize
+    if not (labels and whole and (first + shape <= size).all() and np.isfinite(numbers).all()):
+        raise ProtocolError(
+            f"an IMAGE of {columns} x {rows} x {slices} pixels, {components} components, scalar "
+            f"type {kind} and {len(content)} bytes is not read. Allowed: one slice of labels "
+            "(uint8, uint16), such as an array of 1 x rows x columns, with a finite matrix."
+        )
+    sent_from_pixel = np.eye(4)
+    sent_from_pixel[:3, :3] = axes
+    sent_from_pixel[:3, 3] = middle + axes @ (first - (size - 1) / 2)
+    values = np.frombuffer(content, form, offset=_IMAGE.size).reshape(rows, columns)
+    return Labels(values, sent_from_pixel, coordinates == 2)
 
 
 def _text(raw: bytes) -> str:

@@ -2,7 +2,8 @@
 
 TRANSFORM is a tool's pose, STRING says when it touches. A fiducial (POINT) named as a part is a
 touch of that part, and places (POLYDATA) named as a part are an outline of it. They count as soon
-as they have not been changed for a moment: they are sent at every movement of the mouse.
+as they have not been changed for a moment: they are sent at every movement of the mouse. IMAGEs of
+labels beside the TRANSFORM of an ultrasound probe are outlines too.
 """
 
 from __future__ import annotations
@@ -10,12 +11,13 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from tumortrack.core.errors import InputError
+from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.evidence import Outline, Touch
 from tumortrack.core.geometry import RAS_FROM_LPS, Affine, transform_points
 from tumortrack.live.poses import PoseBuffer
@@ -23,6 +25,7 @@ from tumortrack.live.values import SinkContext
 from tumortrack_devices.igtl import message as igtl
 from tumortrack_devices.igtl.link import Link
 from tumortrack_devices.igtl.message import Header
+from tumortrack_devices.tools.label_planes import LabelPlanes
 from tumortrack_devices.tools.tip import Piece, TipConfig, TipTool
 
 _SETTLED_S = 0.5  # a drawn piece that has not changed for so long is meant
@@ -42,9 +45,14 @@ class OpenIgtLinkToolConfig(TipConfig, frozen=True, kw_only=True, tag="openigtli
     Attributes:
         name: device of the tool's TRANSFORM, of which 20 characters count; empty: there is no tool,
             only what is drawn.
+        image: device of IMAGEs of labels (1: the organ, 2: tumor_1, ...), or of masks of ``part``.
+        image_to_probe: as of `locate`, from the IMAGE's frame (pixels, or as its own matrix has
+            it) to that of the TRANSFORM. Without it and name= that matrix states its pose.
+        lag_s: by which stamps of images are late.
         contact: device of a STRING that is 1 while the tip touches, else 0.
         space: ras negates x and y, as 3D Slicer has them; lps takes them as they are. Default: ras
-            of who connects to us, lps of a server.
+            of who connects to us, lps of a server. An IMAGE that states its pose and that it is LPS
+            is taken as it is.
         clock: when a pose or contact was: sender: by its stamp; arrival: as it comes; auto: by its
             stamp if that of the first is at most 0.1 s old, else the clocks differ: as it comes.
         host: as the server: which of this machine's addresses; 0.0.0.0: all.
@@ -54,6 +62,9 @@ class OpenIgtLinkToolConfig(TipConfig, frozen=True, kw_only=True, tag="openigtli
 
     address: str = "18945"
     name: str = ""
+    image: str = ""
+    image_to_probe: Path | None = None
+    lag_s: float = 0.0
     contact: str = "contact"
     space: Literal["", "ras", "lps"] = ""
     clock: Literal["auto", "sender", "arrival"] = "auto"
@@ -63,6 +74,11 @@ class OpenIgtLinkToolConfig(TipConfig, frozen=True, kw_only=True, tag="openigtli
         super().__post_init__()
         if not self.port_text.isdecimal() or not 0 <= int(self.port_text) <= 65535:
             raise InputError(f"openigtlink: {self.address!r} is not HOST, HOST:PORT or PORT.")
+        self.check_between("openigtlink:", lag_s=(-0.4, 2))  # images and poses wait so long
+        placed = bool(self.image and self.name)
+        if placed is (self.image_to_probe is None) or (self.lag_s and not placed):
+            needed = "name=, image= and image_to_probe=FILE (then also lag_s=), or image= alone"
+            raise InputError(f"openigtlink: images need {needed}, if their matrix is their pose.")
 
     @property
     def server(self) -> str:
@@ -83,12 +99,14 @@ class OpenIgtLinkTool(TipTool):
     """``link``: the connection."""
 
     def __init__(self, config: OpenIgtLinkToolConfig, context: SinkContext, name: str) -> None:
-        super().__init__(config, context, name, "" if config.name else None)
-        self._device, self._contact_device = (
-            name[: igtl.LONGEST_DEVICE] for name in (config.name, config.contact)
+        super().__init__(config, context, name, "" if config.name or config.image else None)
+        self._device, self._image_device, self._contact_device = (
+            name[: igtl.LONGEST_DEVICE] for name in (config.name, config.image, config.contact)
         )
         self._came = dict[tuple[str, str], None]()  # types and devices
-        self._posed, self._absent, self._apart_s = False, "", time.monotonic()
+        expected = {"TRANSFORM": self._device, "IMAGE": self._image_device}
+        self._expected = {kind: device for kind, device in expected.items() if device}
+        self._absent, self._apart_s = "", time.monotonic()
         self._watched = config.clock == "auto"
         self._stamped: bool | None = {"sender": True, "arrival": False}.get(config.clock)
         ras = config.space == "ras" or not (config.space or config.server)
@@ -97,12 +115,16 @@ class OpenIgtLinkTool(TipTool):
         # By device and number of the fiducial; when each was changed last; None: it was given.
         self._drawn: dict[tuple[str, int], tuple[Piece, float | None]] = {}
         self._heard_fault, self._server, self._reached_s = "", config.server, time.monotonic()
+        about = context.parts, config.part, self._axes, config.image_to_probe
+        self._lag_ns, self._planes = round(config.lag_s * 1e9), LabelPlanes(*about)
         self._readers = {
             "TRANSFORM": self._hear_pose,
             "STRING": self._hear_contact,
             "POINT": self._hear_points,
             "POLYDATA": self._hear_outline,
         }
+        if config.image:
+            self._readers["IMAGE"] = self._hear_image
         self.link = Link(
             *(config.host, int(config.port_text), config.server),
             *(self._heard, self._faulty, self._readers),
@@ -116,7 +138,7 @@ class OpenIgtLinkTool(TipTool):
         now_s = time.monotonic()
         if not self.link.receivers:
             self._apart_s = now_s
-        elif self._device and not self._posed and now_s - self._apart_s > _SILENT_S:
+        elif self._expected and now_s - self._apart_s > _SILENT_S:
             self._absent = self._absent or self._other_words()
             fault = fault or self._absent
         if not self._server or self.link.receivers:
@@ -126,7 +148,12 @@ class OpenIgtLinkTool(TipTool):
         self.trouble = fault or self.trouble
 
     def drawn(self) -> list[Piece]:
-        now_s, done = time.monotonic(), []
+        now_s, done = time.monotonic(), list[Piece]()
+        try:
+            for piece in self._planes.pieces(self._poses, self._lag_ns):
+                done.append(piece)
+        except NoEstimate:
+            self.trouble = self.trouble or "images are left out, at whose times no pose is known"
         with self._lock:
             for key, (piece, changed_s) in self._drawn.items():
                 if changed_s is not None and now_s - changed_s >= _SETTLED_S:
@@ -138,11 +165,12 @@ class OpenIgtLinkTool(TipTool):
         self.link.close()
 
     def _other_words(self) -> str:
-        """What comes, where the tool's pose does not."""
-        others = ", ".join(f"{kind} of {device!r}" for kind, device in [*self._came])
+        """What comes, where the tool's pose or images do not."""
+        some = [*self._expected.items()], [*self._came]
+        missing, others = (", ".join(f"{kind} of {name!r}" for kind, name in one) for one in some)
         return (
-            f"it is connected, but no TRANSFORM of {self._device!r} comes; what comes is "
-            f"{others or 'nothing'}. Allowed: name= as it is sent"
+            f"it is connected, but no {missing} comes; what comes is {others or 'nothing'}. "
+            "Allowed: name= and image= as they are sent"
         )
 
     def _time_of(self, header: Header) -> int:
@@ -168,16 +196,24 @@ class OpenIgtLinkTool(TipTool):
         """One message, in the link's thread. Raises ProtocolError."""
         if len(self._came) < _MOST_DEVICES:
             self._came[header.type, header.device] = None
+        if self._expected.get(header.type) == header.device:
+            del self._expected[header.type]
+            self._absent = ""
         if (reader := self._readers.get(header.type)) is not None:
             reader(header, *igtl.unpack_body(header, body))
 
     def _hear_pose(self, header: Header, content: bytes, metadata: Mapping[str, str]) -> None:
         if header.device != self._device:
             return
-        self._posed, self._absent = True, ""
         if metadata.get("TransformStatus", "OK") == "OK":
             pose = self._axes @ igtl.unpack_transform(content) @ self._axes
             self._poses.add(self._time_of(header), pose)
+
+    def _hear_image(self, header: Header, content: bytes, _: Mapping[str, str]) -> None:
+        """Labels take their time to be found: which clock counts, only poses say."""
+        if header.device == self._image_device and not (self._device and self._stamped is None):
+            stamped = self._stamped and header.stamp_ns
+            self._planes.hear(header.stamp_ns if stamped else time.time_ns(), content)
 
     def _hear_contact(self, header: Header, content: bytes, _: Mapping[str, str]) -> None:
         if header.device == self._contact_device:
