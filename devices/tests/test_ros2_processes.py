@@ -337,12 +337,15 @@ def test_fast_dds_hears_and_is_heard(tmp_path: Path, messages: Messages) -> None
                     placed = poses.at(seen)
                 with contextlib.suppress(InputError):
                     assert damaged.read(1 / 30) is None
+            known = poses.known(0.5)  # of the sink's own frames as well
             assert all(map(int, there.line().split()))
     finally:
         for one in (damaged, poses, *sinks):
             one.close()
     # Fast DDS said the camera on the tool before we listened.
     np.testing.assert_allclose(placed, TURNED @ SHIFTED, atol=1e-9)
+    for parent, child, way in ways.values():
+        np.testing.assert_allclose(known[parent, child], way, atol=1e-9)
     tf, static, status, scene = (
         messages.from_bytes((tmp_path / f"heard_{topic[1:]}").read_bytes(), kind)
         for topic, kind in kinds.items()

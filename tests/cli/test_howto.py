@@ -25,6 +25,7 @@ LEFT = {  # what a page's commands leave behind, besides what they print
     "ct": ("CASE/qc.png", "RUN/tumor_2.ply", "RUN_WITH_POINTS/points.csv"),
     "evaluate": ("REPORT/index.html",),
     "evidence": ("RUN/report.json", "TOUCHED/tumor_1.ply"),
+    "frames": ("frames.png", "right.json"),
     "organ": ("LIVER/liver.ply",),
     "plan": ("PLAN/plan.png",),
     "poor-answer": ("RUN/index.html",),
@@ -51,14 +52,17 @@ def write_touches(path: Path, case: Case) -> None:
 
 
 @pytest.fixture
-def desk(tmp_path, phantom_case, elastic_model):
+def desk(tmp_path, page, phantom_case, elastic_model):
     """A reader's folder: a label map, a case and its model, a cloud, points of the CT."""
     shutil.copy(phantom_case / "labels.nii.gz", tmp_path)
     shutil.copytree(elastic_model, tmp_path / "MODEL")
     case = load_case(phantom_case)
     cloud = cloud_by_rays(case, looking_down(case)).astype(np.float32)
     write_cloud_ply(tmp_path / "cloud.ply", cloud)
-    write_touches(tmp_path / "touches.csv", case)
+    if page.stem == "frames":
+        shutil.copytree(PAGES[0].parents[2] / "examples" / "frames", tmp_path, dirs_exist_ok=True)
+    else:
+        write_touches(tmp_path / "touches.csv", case)
     points = case.anatomy.tumors[0].vertices_mm[:3]
     np.savetxt(tmp_path / "points.csv", points, delimiter=",", header="x,y,z", comments="")
     return tmp_path
@@ -74,7 +78,7 @@ def test_a_page_does_what_it_says(page, desk, ready_case, capsys, monkeypatch):
     with contextlib.chdir(desk):
         for program, *arguments in found:
             assert program == "tumortrack"
-            poor = (0, 4) if arguments[0] == "locate" else (0,)
+            poor = (0, 4) if arguments[0] in ("locate", "frames") else (0,)
             assert run(arguments) in poor, (arguments, capsys.readouterr().err)
     for left in LEFT[page.stem]:
         assert (desk / left).stat().st_size > 0

@@ -81,7 +81,7 @@ def test_options_that_messages_name_are_options_of_some_command(capsys, monkeypa
     monkeypatch.setenv("COLUMNS", "200")
     known = set(OTHERS)
     for command in (*COMMANDS, "simulate", "evaluate", "margins", "compile", "inspect", "doctor",
-                    "track", "resect", "reference", "calibrate register"):  # fmt: skip
+                    "frames", "track", "resect", "reference", "calibrate register"):  # fmt: skip
         known |= options_of(command, capsys)
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):

@@ -32,6 +32,7 @@ from tumortrack.core import store
 from tumortrack.core.config import from_builtins, to_builtins
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.evidence import FreeSpace, Outline, Touch
+from tumortrack.core.frames import FrameGraph
 from tumortrack.core.types import Volume
 from tumortrack.io.evidence_files import evidence_json
 
@@ -146,6 +147,10 @@ TOOL_TABLE = """stamp_ns,frame_id,x_mm,y_mm,z_mm,qw,qx,qy,qz
 1700000000000000000,base_link,412.5,-30.0,510.25,0.0,1.0,0.0,0.0
 1700000000100000000,base_link,412.5,-31.0,510.25,0.0,1.0,0.0,0.0
 """
+TOUCHED_TABLE = "a_x,a_y,a_z,b_x,b_y,b_z\n0,0,1,9,9,9\n80,0,0,89,9,8\n0,70,0,9,79,8\n"
+PLUS = """<?xml version="1.0"?><PlusConfiguration><CoordinateDefinitions>
+<Transform From="Image" To="Probe" Matrix="0.1 0 0 5 0 0.1 0 6 0 0 0.1 7 0 0 0 1" Error="0.5"/>
+</CoordinateDefinitions></PlusConfiguration>"""
 IDENTITY = np.eye(4).tolist()
 KIT = {
     "case_sha256": "0",
@@ -202,6 +207,18 @@ def read_beside(path: Path) -> object:
     return read_meshes([path])
 
 
+def read_known(path: Path) -> object:
+    """As what `frames` reads, to its end."""
+    from tumortrack.live.frame_files import KnownFrames
+    from tumortrack.report.frames import chain_lines, open_line
+
+    (known := KnownFrames()).add(str(path))
+    known.at(0)
+    links = [*known.links, *(fit.link for fit in known.fits)]
+    graph = FrameGraph([*links, *links], "camera", known.frames)
+    return [*chain_lines(graph), *map(open_line, graph.open_cycles())]
+
+
 # What reads it, by the file's name, and valid contents.
 FILES: dict[str, tuple[Any, tuple[object, ...]]] = {
     "in.ply": (
@@ -245,6 +262,9 @@ FILES: dict[str, tuple[Any, tuple[object, ...]]] = {
     "scan.mha": ("tumortrack.api:read_ultrasound", (scan(True), scan(False))),
     "scan.nrrd": ("tumortrack.api:read_ultrasound", (SCAN_NRRD,)),
     "poses.csv": ("tumortrack.live.poses:FilePoses", (TOOL_TABLE,)),
+    "frames.json": (read_known, ({**FRAME, "robot_from_camera": TURN, "error_mm": 1},)),
+    "frames.csv": (read_known, (TOUCHED_TABLE, TOOL_TABLE)),
+    "plus.xml": (read_known, (PLUS,)),
     "kit.json": ("tumortrack_experiment.kit_file:read_kit", (KIT,)),
     "lens.json": (
         "tumortrack_experiment.calibrate.lens:read_lens",

@@ -18,6 +18,7 @@ from refused import refused
 from tumortrack.core.errors import InputError
 from tumortrack.core.store import natural, read_json
 from tumortrack.core.types import Intrinsics
+from tumortrack.io.csv_tables import whole_in
 from tumortrack.io.depth_files import read_camera, read_cloud, read_depth, read_poses
 from tumortrack.io.evidence_files import read_evidence
 from tumortrack.io.ply import cloud_ply
@@ -140,6 +141,12 @@ def test_a_table_that_may_mean_two_things_is_refused_where_it_does(name, fault, 
     where = ["line 3"] if "cell" in fault or "number" in fault else []
     with refused(InputError, path, *where):
         reader.read(path)
+
+
+@pytest.mark.parametrize("text", ["9e9999999", "1e999999999999999999", "sNaN", "-Infinity", "0.5"])
+def test_a_number_that_is_not_whole_is_refused(text):
+    with refused(InputError, "line 3", text):
+        whole_in(text, "line 3")
 
 
 def test_an_outline_of_one_piece_and_touches_of_their_own(tmp_path):

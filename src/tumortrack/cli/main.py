@@ -32,7 +32,7 @@ _MODULES = {  # in the order of --help; only the chosen command's is imported
     "demo": "demo", "prepare": "cases", "export": "cases", "train": "training",
     "locate": "locate", "track": "track", "simulate": "cases",
     "evaluate": "cases", "compile": "doctor",
-    "inspect": "cases", "doctor": "doctor",
+    "frames": "frames", "inspect": "cases", "doctor": "doctor",
 }  # fmt: skip
 # Commands of other distributions: if one is missing, the message names its distribution.
 _DISTRIBUTIONS = {

@@ -7,7 +7,7 @@ import csv
 import io
 import re
 from collections.abc import Callable, Sequence
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal, DecimalException
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -127,7 +127,7 @@ def whole_in(text: str, where: str) -> int:
         number = Decimal(text)
         if number == number.to_integral_value() and abs(number) < 2**63:
             return int(number)
-    except InvalidOperation:
+    except DecimalException:  # no number, or an exponent beyond its own range
         pass
     raise InputError(f"{where}: {text[:40]!r} is no whole number, or beyond 63 bits.")
 

@@ -58,9 +58,7 @@ def read_frames(path: Path, moves: bool = False) -> PublishedFrame:
     """The robot's frame from JSON with keys of ``CalibrationFile``, or YAML of easy_handeye (ROS
     1 and 2). ``moves``: for a camera on a tool. Raises InputError: it is missing, has an
     unknown key, no rigid transform, or not exactly one way of giving the pose."""
-    of_ros = path.suffix.lower() in _YAML
-    given = _easy_handeye(path) if of_ros else read_json(path)
-    file = from_builtins(given, CalibrationFile, str(path))
+    file = from_builtins(calibration_keys(path), CalibrationFile, str(path))
     matrices = {
         name: read_rigid(rows, file.unit, f"{path}: {name}")
         for name in file.__struct_fields__
@@ -94,6 +92,11 @@ def read_frames(path: Path, moves: bool = False) -> PublishedFrame:
         table = x, y, z, offset * (1000 if file.unit == "m" else 1)
     error = file.error_mm, file.error_deg
     return PublishedFrame(file.frame_id, robot_from_camera, True, camera, table, *error, moves)
+
+
+def calibration_keys(path: Path) -> dict[str, Any]:
+    """What a file says, by keys of ``CalibrationFile``, unchecked where it is JSON."""
+    return _easy_handeye(path) if path.suffix.lower() in _YAML else read_json(path)
 
 
 def _easy_handeye(path: Path) -> dict[str, Any]:

@@ -39,6 +39,10 @@ class CameraPoses:
     def pose(self, seen: Observation) -> Affine:
         """The same without the tool."""
 
+    def known(self, seconds: float) -> dict[tuple[str, str], Affine]:
+        """The newest ``b_from_a`` of all (b, a) heard of within so long, where it hears of any."""
+        return {}
+
     def close(self) -> None:
         """Release everything."""
 
@@ -73,6 +77,11 @@ class PoseBuffer:
             self._poses.append(pose)
             del self._stamps_ns[:-kept], self._poses[:-kept]
             self._lock.notify_all()
+
+    @property
+    def newest(self) -> Affine:
+        """There is one."""
+        return self._poses[-1]
 
     def at(self, stamp_ns: int, wait_s: float = 0.0) -> Affine:
         """Interpolated between its neighbours (linear, slerp). ``wait_s``: for the later one.
@@ -119,6 +128,7 @@ class FilePoses(CameraPoses):
     def __init__(self, path: Path) -> None:
         table = read_pose_table(path)
         self.frame_id, self.poses = table.frame_id, PoseBuffer()
+        self.stamps_ns = table.stamps_ns
         stamps_ns = table.stamps_ns.tolist()
         for stamp_ns, pose in zip(stamps_ns, table.poses, strict=True):
             self.poses.add(stamp_ns, pose, len(stamps_ns))

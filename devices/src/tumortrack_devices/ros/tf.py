@@ -67,6 +67,16 @@ class TfPoses(CameraPoses):
                 for transform in self._bus.messages.from_bytes(raw, TRANSFORMS).transforms:
                     self._keep(transform, static=subscriber is self._tf_static)
 
+    def known(self, seconds: float) -> dict[tuple[str, str], Affine]:
+        until_s = time.monotonic() + seconds
+        while (left_s := until_s - time.monotonic()) > 0:
+            self._bus.wait(left_s)
+            self.take()
+        return {
+            (parent, child): poses.newest if isinstance(poses, PoseBuffer) else poses
+            for child, (parent, poses) in self._known.items()
+        }
+
     def close(self) -> None:
         self._bus.close()
 
