@@ -296,18 +296,23 @@ def by_suffix(update, results: ResultMessages | None = None):
 def headers_of(message) -> list:
     if hasattr(message, "header"):
         return [message.header]
-    inside = message.transforms if hasattr(message, "transforms") else message.markers
-    return [one.header for one in inside]
+    names = ("transforms", "markers")
+    return [one.header for name in names for one in getattr(message, name, ())]
 
 
 @pytest.mark.parametrize(
     "update", [small_update(frames=TURNED), replace(empty_update(), published_frame=TURNED)]
 )
 def test_every_message_has_the_update_s_stamp_and_frame(update):
-    headers = [h for message in by_suffix(update).values() for h in headers_of(message)]
+    """A pose that is not valid has the stamp 0, as CRTK wants it."""
+    out = by_suffix(update)
+    poses = [out.pop(name).header for name in list(out) if "measured_cp" in name]
+    headers = [h for message in out.values() for h in headers_of(message)]
     assert len(headers) >= 6
     assert {stamp_of(h) for h in headers} == {update.stamp_ns}
-    assert {h.frame_id for h in headers} == {"table"}
+    assert {stamp_of(h) for h in poses} == {update.stamp_ns if update.estimate else 0}
+    assert len(poses) == 2 * len(PARTS)
+    assert {h.frame_id for h in (*headers, *poses)} == {"table"}
 
 
 def test_an_estimate_is_sent_in_metres_in_the_published_frame():

@@ -5,20 +5,30 @@ from __future__ import annotations
 import contextlib
 import json
 import signal
+import sys
+from contextlib import ExitStack
+from pathlib import Path
 
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
+import clients
+from dvrk_files import open_cv
+from ros2_objects import own_graph, process
 from stories import refusal, succeeded, tumortrack
 from track_objects import PATIENT, World, ended_when, start, told, virtual, wait_for
 from tumortrack.core.camera import d405, project
 from tumortrack.core.errors import InputError
+from tumortrack.core.geometry import transform_points
+from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.poses import COLUMNS, CONTACT
 from tumortrack.live.values import SourceEnded
 from tumortrack_devices.sources.recording import RecordingSourceConfig
 
 pytestmark = pytest.mark.slow
+
+SUPPORT = Path(__file__).parent / "support"
 
 
 @pytest.fixture
@@ -201,3 +211,39 @@ def test_several_cameras_and_one_that_moves_are_tracked_from_recordings(world, t
     assert [line.split(",")[0] for line in kept[1:]] == [str(one) for one in stamps[:-1]]
     alone = tumortrack("track", world.model, source, "--views", f"{source}&fps=30")
     assert "--views needs --poses" in refusal(alone)
+
+
+def test_a_dvrk_that_touches_the_organ_is_evidence_in_track(world, tmp_path) -> None:
+    """With the file that dVRK's camera registration wrote, and an arm of rclpy. The tip stands on
+    the organ where the camera sees it, and its jaw closes once a second."""
+    live = tmp_path / "live"
+    source = virtual(world, fps=10, camera_motion="false", breathing="false", instrument="false")
+    recorded(world, live, 5, source)
+    words, _ = touched_place(live)
+    camera_mm = np.array([[float(word) for word in words.split(",")]])
+    frame = tmp_path / "PSM1-registration-open-cv.json"
+    frame.write_text(open_cv("camera"))
+    base_from_camera = read_frames(frame).published_from_camera
+    place_m = transform_points(base_from_camera, camera_mm)[0] / 1000
+    report = tmp_path / "report.json"
+    tool = "psm1=crtk:/PSM1?pose=local/measured_cp&tip_mm=2&via=dds"
+    given = source, "--frame", frame, "--tool", tool, "--report", report
+    peer = sys.executable, SUPPORT / "crtk_peer.py", "arm", *place_m.tolist()
+    with own_graph(), ExitStack() as running:
+        environment = clients.environment("ros-jazzy-rclpy")
+        running.enter_context(process(*peer, environment=environment)).line()
+
+        def enough() -> bool:
+            counts = told(report)["tools"]["psm1"] if report.exists() else {}
+            return counts.get("touch", 0) >= 3
+
+        ended_when(start(world, *given, f"recording:{tmp_path / 'seen'}"), enough)
+    pieces = [piece for known in evidence(tmp_path / "seen").values() for piece in known]
+    assert {(piece.name, piece.tool) for piece in pieces} == {("touch", "psm1")}
+    places_mm = np.array([piece.place_mm for piece in pieces])
+    np.testing.assert_allclose(places_mm, np.tile(camera_mm, (len(pieces), 1)), atol=1e-3)
+    counts = told(report)["tools"]["psm1"]
+    assert counts.get("rejected", 0) == 0, counts
+    found = [one["estimate"] for one in reports(tmp_path / "seen") if one["estimate"]]
+    used = [each for one in found for each in one.get("evidence", ())]
+    assert any(not each["rejected"] for each in used)

@@ -9,17 +9,23 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
+from contextlib import ExitStack
 from dataclasses import replace
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 from PIL import Image
+from rosbags.highlevel import AnyReader
 from safetensors import safe_open
 
+import clients
 from plan_objects import located, sphere
 from refused import refused
 from reports import bounded, poor, report_of
+from ros2_objects import own_graph, process
 from stories import (
     COMMAND,
     answered,
@@ -40,8 +46,10 @@ from tumortrack.io.case import load_case
 from tumortrack.io.mesh_files import read_mesh, write_mesh
 from tumortrack.io.ply import parse_ply_properties, write_cloud_ply
 from tumortrack.io.run_folder import write_estimate
+from tumortrack_devices.ros.messages import stamp_of
 from tumortrack_resection import begin_plan, begin_resection, plan_resection
 from tumortrack_resection.arms.body import cell_urdf
+from tumortrack_resection.arms.cell import tip_places
 from tumortrack_resection.files import read_plan
 from tumortrack_resection.halt import CUT_NOTE
 from tumortrack_resection.motions import JOINTS
@@ -49,6 +57,7 @@ from tumortrack_resection.values import CUTS_TUMOR, ELECTRODE, OVER_BUDGET, POOR
 
 pytestmark = pytest.mark.slow
 
+CRTK_PEER = Path(__file__).parents[2] / "devices" / "tests" / "support" / "crtk_peer.py"
 WIDE = ("--margin", 8)
 TUMOR = sphere((12.0, -14.0, 165.0), 12.0)  # half sunk in the organ's upper side
 NEIGHBOUR = sphere((-21.0, -4.0, 168.0), 8.0)  # 14.6 mm beside it
@@ -629,13 +638,29 @@ def test_a_live_world_that_lies_elsewhere_is_planned_anew_and_cut(
     command = ("plan", tmp_path / "run", tmp_path / "plan", "--method", method)
     succeeded(tumortrack(*command, "--accept-poor", "--accept-budget"))
     world = f"virtual:{phantom_case}?breathing=false&instrument=false&camera_motion=false&fps=10"
-    report = tmp_path / "report.json"
-    output = succeeded(
-        tumortrack(
-            "resect", tmp_path / "plan", "--live", elastic_model, world, "--speed", 10,
-            "--report", report, "--replan-cut",
-        )
-    )  # fmt: skip
+    report, seen = tmp_path / "report.json", tmp_path / "seen"
+    with own_graph(), ExitStack() as running:
+        peer = sys.executable, CRTK_PEER, "simulator"
+        environment = clients.environment("ros-jazzy-rclpy")
+        simulator = running.enter_context(process(*peer, environment=environment))
+        simulator.line()
+        sinks = "crtk:/PSM1?simulator=true&via=dds", f"recording:{seen}"
+        output = succeeded(
+            tumortrack(
+                "resect", tmp_path / "plan", *sinks, "--live", elastic_model, world, "--speed", 10,
+                "--report", report, "--replan-cut",
+            )
+        )  # fmt: skip
+        end = read_plan(tmp_path / "plan").motions.stages[-1].joints_rad[-1, :6]
+        tip_mm = tip_places(read_plan(tmp_path / "plan").cell)
+        off_mm: list[float] = []
+
+        def home_again(said):
+            off_mm.append(float(np.linalg.norm(place_of(said) - tip_mm("cutter", end))))
+            return off_mm[-1] < 1e-3 and max(off_mm) > 50
+
+        heard = simulator.lines_until(home_again)
+    follows_the_arm(heard, seen, tip_mm)
     assert "done: both virtual arms are home." in output
     content = json.loads(report.read_text())
     passed = content["resection"]["log"]
@@ -650,6 +675,31 @@ def test_a_live_world_that_lies_elsewhere_is_planned_anew_and_cut(
     budgets = content["resection"]["budget"]
     assert budgets["worst"]["left_mm"] < 0  # accepted when it was planned
     assert budgets["worst"]["tracking_mm"] > 0
+
+
+def place_of(said):
+    return np.array(said["matrix"])[:3, 3]
+
+
+def follows_the_arm(heard, recording, tip_mm):
+    """A simulator was sent where the tip is by the joints of the same moment, in good results that
+    do not halt the arms, and in no others."""
+    with AnyReader([recording]) as reader:
+        wanted = {"/tumortrack/joint_states": {}, "/tumortrack/diagnostics": {}}
+        connections = [c for c in reader.connections if c.topic in wanted]
+        for connection, _, raw in reader.messages(connections):
+            message = reader.deserialize(raw, connection.msgtype)
+            wanted[connection.topic][stamp_of(message.header)] = message
+    joints, states = wanted.values()
+    for said in heard:
+        at = joints[said["stamp_ns"]]
+        joint = dict(zip(at.name, at.position, strict=True))
+        own = np.array([joint[name] for name in JOINTS if name.startswith("cutter")])
+        np.testing.assert_allclose(place_of(said), tip_mm("cutter", own), atol=1e-3)
+        assert {status.level for status in states[said["stamp_ns"]].status} == {0}
+    stopped = sum(states[at].status[1].level > 0 for at in states)
+    assert 10 < len(heard) <= len(states) - stopped
+    assert stopped  # the world lies elsewhere
 
 
 def test_from_python_too_a_real_arm_needs_the_live_loop_and_a_person(given, monkeypatch, unchecked):

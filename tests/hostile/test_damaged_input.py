@@ -25,6 +25,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from dvrk_files import dvrk, open_cv
 from raw_files import ball, nifti_header, npy, npz, nrrd, pcd, ply, png, sphere
 from stereo_objects import endoscope
 from tumortrack.case.meshes import read_meshes
@@ -261,6 +262,11 @@ FILES: dict[str, tuple[Any, tuple[object, ...]]] = {
     "calibration.yaml": ("tumortrack.live.calibration_file:read_frames", (EASY_HANDEYE,)),
     "scan.mha": ("tumortrack.api:read_ultrasound", (scan(True), scan(False))),
     "scan.nrrd": ("tumortrack.api:read_ultrasound", (SCAN_NRRD,)),
+    "PSM1-registration-open-cv.json": (
+        "tumortrack.live.calibration_file:read_frames",
+        (open_cv(),),
+    ),
+    "PSM1-registration-dVRK.json": ("tumortrack.live.calibration_file:read_frames", (dvrk(),)),
     "poses.csv": ("tumortrack.live.poses:FilePoses", (TOOL_TABLE,)),
     "frames.json": (read_known, ({**FRAME, "robot_from_camera": TURN, "error_mm": 1},)),
     "frames.csv": (read_known, (TOUCHED_TABLE, TOOL_TABLE)),

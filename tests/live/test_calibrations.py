@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from camera_objects import ASIDE, BASE, seen_at
+from dvrk_files import CAMERA_FROM_BASE_M, dvrk, of_ecm, open_cv
 from live_objects import STAMP_NS, small_update
 from refused import refused
 from tumortrack.core.errors import InputError
@@ -18,6 +19,7 @@ from tumortrack.live.cameras import camera_setup
 from tumortrack.live.poses import COLUMNS
 from tumortrack.live.values import PublishedFrame
 
+PSM2_OPEN_CV, PSM2_DVRK = (f"PSM2-registration-{axes}.json" for axes in ("open-cv", "dVRK"))
 EYE = np.eye(4).tolist()
 
 
@@ -115,3 +117,33 @@ def test_a_camera_on_a_tool_is_placed_by_its_calibration(tmp_path):
     ):
         with pytest.raises(InputError):
             setup(**wrong)
+
+
+@pytest.mark.parametrize(("name", "text"), [(PSM2_OPEN_CV, open_cv()), (PSM2_DVRK, dvrk())])
+def test_both_files_of_a_dvrk_say_where_the_arms_base_is_before_the_camera(name, text, tmp_path):
+    """In either, dVRK's own use of it: a place in the arm's base, m, to OpenCV's camera."""
+    (tmp_path / name).write_text(text)
+    frames = read_frames(tmp_path / name)
+    assert (frames.frame_id, frames.camera_frame_id) == ("PSM2_base", "decklink_frame")
+    base_m = np.array([0.02, -0.07, -0.11, 1.0])
+    camera_mm = 1000 * (CAMERA_FROM_BASE_M @ base_m)[:3]
+    there_mm = frames.published_from_camera @ [*camera_mm, 1.0]
+    np.testing.assert_allclose(there_mm[:3], 1000 * base_m[:3], atol=1e-5)
+
+
+def test_a_dvrks_file_is_refused_where_it_does_not_say_what_it_means(tmp_path):
+    def refused_as(name, text, *data):
+        (tmp_path / name).write_text(text)
+        with refused(InputError, *data):
+            read_frames(tmp_path / name)
+
+    refused_as("PSM2_registration.json", open_cv(), "PSM2_registration.json")  # which axes?
+    refused_as(PSM2_DVRK, of_ecm(), "ECM", PSM2_OPEN_CV)
+    refused_as(PSM2_OPEN_CV, open_cv().replace("0.058", "58.0"), PSM2_OPEN_CV)  # mm
+    refused_as(PSM2_OPEN_CV, open_cv().replace("0.6454", "0.9"), PSM2_OPEN_CV)
+    refused_as(PSM2_OPEN_CV, open_cv().replace('"reference-frame"', '"x"'), PSM2_OPEN_CV)
+    refused_as(PSM2_OPEN_CV, "{" + open_cv(), PSM2_OPEN_CV)
+    (tmp_path / PSM2_OPEN_CV).write_text(open_cv("camera"))  # its messages named no frame
+    assert read_frames(tmp_path / PSM2_OPEN_CV).camera_frame_id == ""
+    with refused(InputError, "tool_from_camera"):
+        read_frames(tmp_path / PSM2_OPEN_CV, moves=True)

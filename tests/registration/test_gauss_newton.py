@@ -238,6 +238,31 @@ def test_covariances_follow_from_where_small_changes_take_points():
     np.testing.assert_allclose(many, np.tile(found, (100, 1, 1)), rtol=1e-4, atol=1e-6)
 
 
+def test_the_covariance_of_poses_follows_from_what_small_changes_do():
+    """Finite differences of place and turn by each unknown; far fits and the depths widen it."""
+    points, mixed = about(9, 4, 0.9), np.random.default_rng(3).normal(size=(26, 26)) * 0.05
+    base = replace(placed(share=0.3), covariance=mixed @ mixed.T, std_scale=1.3)
+    slopes, small = [], 1e-2
+    for unit in np.eye(26) * small:
+        ways = []
+        for changed in (base.changed(unit), base.changed(-unit)):
+            turn = Rotation.from_matrix(changed.rotation @ base.rotation.T).as_rotvec()
+            ways.append(np.hstack([changed.forward(points), np.tile(turn, (len(points), 1))]))
+        slopes.append((ways[0] - ways[1]) / (2 * small))
+    expected = 1.3**2 * np.einsum("pna,pq,qnb->nab", slopes, base.covariance, slopes)
+    found = base.pose_covariance(points)
+    apart = np.linalg.norm(found - expected, axis=(1, 2)) / np.linalg.norm(expected, axis=(1, 2))
+    assert apart.max() < 0.05
+    np.testing.assert_allclose(found[:, 3:, 3:], expected[:, 3:, 3:], rtol=1e-4, atol=1e-9)
+    other = nudged(base, [3, -2, 5], [0.1, -0.05, 0.1])
+    wider = replace(base, alternatives=((other, 0.2),), depth_share=0.01).pose_covariance(points)
+    assert np.linalg.eigvalsh(wider - found).min() > -1e-9
+    turn = base.rotation @ [0.1, -0.05, 0.1]
+    more = (wider - found)[:, 3:, 3:] / 1.3**2
+    np.testing.assert_allclose(more, np.tile(0.2 * np.outer(turn, turn), (9, 1, 1)), atol=1e-6)
+    assert replace(base, covariance=None).pose_covariance(points) is None
+
+
 # --- frames ---
 
 

@@ -29,7 +29,7 @@ from tumortrack.live.values import Observation
 from tumortrack_devices.ros.bus import Publish, open_bus
 from tumortrack_devices.ros.dds import domain_id, idl_type
 from tumortrack_devices.ros.messages import stamp_of
-from tumortrack_devices.ros.results import DIAGNOSTICS, MARKERS, ResultMessages
+from tumortrack_devices.ros.results import DIAGNOSTICS, MARKERS, PLACE, ResultMessages
 from tumortrack_devices.ros.sensors import CAMERA_INFO, CLOUD, messages_seen, plain_cloud
 from tumortrack_devices.ros.tf import TRANSFORMS
 from tumortrack_devices.sources.ros import Ros2SourceConfig
@@ -119,7 +119,13 @@ def hear(seconds: float) -> None:
     topic = Topic(member := DomainParticipant(domain_id()), "rt/tumortrack/cloud", idl_type(CLOUD))
     _held = DataReader(member, topic, Qos(reliable, volatile, Policy.History.KeepLast(1)))
     out = ResultMessages(messages, small_setting()).messages(empty_update())
-    kinds = {sent.suffix: sent.message_type for sent in out if not sent.suffix.startswith("/")}
+    kinds = {
+        sent.suffix: sent.message_type
+        for sent in out
+        if sent.message_type
+        in (CLOUD, MARKERS, DIAGNOSTICS, PLACE)  # crtk_peer.py hears the others
+        and not sent.suffix.startswith("/")
+    }
     heard = {name: bus.subscriber(f"/tumortrack/{name}", kind) for name, kind in kinds.items()}
     print(json.dumps({"listens": sorted(heard)}), flush=True)
     end_s = time.monotonic() + seconds

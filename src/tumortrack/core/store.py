@@ -101,10 +101,15 @@ def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object. Raises ArtifactError: missing, too large, not one, or one with
     a key twice."""
     try:
-        content = read_file(path, _LARGEST_MANIFEST)
-        data = json.loads(content, object_pairs_hook=_once)
+        return json_object(read_file(path, _LARGEST_MANIFEST), path)
     except InputError as error:
         raise ArtifactError(str(error)) from error
+
+
+def json_object(content: bytes, path: Path) -> dict[str, Any]:
+    """The JSON object that a file holds. Raises ArtifactError: not one, or one with a key twice."""
+    try:
+        data = json.loads(content, object_pairs_hook=_once)
     except (ValueError, RecursionError) as error:
         raise ArtifactError(f"{path} cannot be read as JSON: {error}.") from error
     if not isinstance(data, dict):

@@ -11,7 +11,7 @@ import numpy as np
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import read_rigid, rigid
-from tumortrack.core.store import read_file, read_json
+from tumortrack.core.store import json_object, read_file, read_json
 from tumortrack.io.csv_tables import number_in, text_of
 from tumortrack.live.values import PublishedFrame
 
@@ -23,6 +23,11 @@ _YAML = (".yaml", ".yml", ".calib")
 _LARGEST_YAML = 2**16  # bytes
 _PAIR = re.compile(r"(\w+)[ \t]*:[ \t]*([^\s{},#]*)")
 _PLACE, _TURN = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
+
+# Names of dvrk_camera_registration's files, which alone say whose base and which axes they mean.
+_DVRK = re.compile(r"(\w+)-registration-(open-cv|dVRK)\.json", re.ASCII)
+_LARGEST_DVRK = 2**16  # bytes
+_UNNAMED = "camera"  # written where the camera's messages name no frame
 
 Rows = tuple[tuple[float, float, float, float], ...]
 
@@ -54,10 +59,20 @@ class CalibrationFile(Config, frozen=True, kw_only=True):
             raise InputError(f"error_deg is {self.error_deg:g}; allowed: 0 to {_LARGEST_DEG:g}.")
 
 
+class _BaseFrame(Config, frozen=True, kw_only=True, rename="kebab"):
+    reference_frame: str
+    transform: Rows
+
+
+class _DvrkFile(Config, frozen=True, kw_only=True, rename="kebab"):
+    base_frame: _BaseFrame
+
+
 def read_frames(path: Path, moves: bool = False) -> PublishedFrame:
-    """The robot's frame from JSON with keys of ``CalibrationFile``, or YAML of easy_handeye (ROS
-    1 and 2). ``moves``: for a camera on a tool. Raises InputError: it is missing, has an
-    unknown key, no rigid transform, or not exactly one way of giving the pose."""
+    """The robot's frame from JSON with keys of ``CalibrationFile``, YAML of easy_handeye (ROS
+    1 and 2), or JSON of dvrk_camera_registration. ``moves``: for a camera on a tool. Raises
+    InputError: it is missing, has an unknown key, no rigid transform, or not exactly one way of
+    giving the pose."""
     file = from_builtins(calibration_keys(path), CalibrationFile, str(path))
     matrices = {
         name: read_rigid(rows, file.unit, f"{path}: {name}")
@@ -96,7 +111,16 @@ def read_frames(path: Path, moves: bool = False) -> PublishedFrame:
 
 def calibration_keys(path: Path) -> dict[str, Any]:
     """What a file says, by keys of ``CalibrationFile``, unchecked where it is JSON."""
-    return _easy_handeye(path) if path.suffix.lower() in _YAML else read_json(path)
+    if path.suffix.lower() in _YAML:
+        return _easy_handeye(path)
+    if (named := _DVRK.fullmatch(path.name)) is not None:
+        return _dvrk_registration(path, *named.groups())
+    if "base-frame" in (given := read_json(path)):
+        raise InputError(
+            f"{path} is of dvrk_camera_registration, but only the name that it gave the file says "
+            "whose base and which axes: PSM1-registration-open-cv.json, say."
+        )
+    return given
 
 
 def _easy_handeye(path: Path) -> dict[str, Any]:
@@ -124,3 +148,23 @@ def _easy_handeye(path: Path) -> dict[str, Any]:
     pose = rigid(Rotation.from_quat(turn).as_matrix(), np.array(metres)).tolist()
     frames = {"frame_id": found[needed[-2]], "camera_frame_id": found[needed[-1]]}
     return {"unit": "m", _TOOL if moves else "robot_from_camera": pose, **frames}
+
+
+def _dvrk_registration(path: Path, arm: str, axes: str) -> dict[str, Any]:
+    """The keys of a ``CalibrationFile`` from what dvrk_camera_registration writes, in metres: where
+    the arm's own base (``PSM1_base``, that of ``local/measured_cp``) is before the camera. dVRK's
+    axes of the camera are OpenCV's turned by half about its axis, and come without braces."""
+    content = read_file(path, _LARGEST_DVRK).strip()
+    data = json_object(b"{%s}" % content if content.startswith(b'"') else content, path)
+    if "measured_cp" in data:
+        raise InputError(
+            f"{path} is of a camera that an ECM holds, and where that was is not in it. Give "
+            f"{arm}-registration-open-cv.json, which was written beside it."
+        )
+    base = from_builtins(data, _DvrkFile, str(path)).base_frame
+    camera_from_base = read_rigid(base.transform, "m", f"{path}: transform")
+    if axes == "dVRK":
+        camera_from_base[:2] *= -1
+    name = "" if base.reference_frame == _UNNAMED else base.reference_frame
+    pose = {"unit": "mm", "camera_from_robot": camera_from_base.tolist()}
+    return {**pose, "frame_id": f"{arm}_base", "camera_frame_id": name}

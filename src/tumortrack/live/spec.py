@@ -84,7 +84,9 @@ SINKS = Registry[SinkConfig](
     "sinks",
     SinkConfig,
     _devices(
-        *("viewer", "recording", "ros2", "moveit", "openigtlink"), ur="tumortrack-resection[ur]"
+        *("viewer", "recording", "ros2", "moveit", "openigtlink"),
+        ur="tumortrack-resection[ur]",
+        crtk="tumortrack-resection",
     ),
 )
 POSES = Registry[PosesConfig](
@@ -95,7 +97,7 @@ POSES = Registry[PosesConfig](
     {"file": "tumortrack.live.poses:PosesFileConfig"},
 )
 TOOLS = Registry[ToolConfig](
-    "tool", "tools", ToolConfig, _devices("file", "ros2", "openigtlink", "ur")
+    "tool", "tools", ToolConfig, _devices("file", "ros2", "openigtlink", "ur", "crtk")
 )
 
 

@@ -132,6 +132,25 @@ class ElasticMotion(Renamed):
         along = self.depth_share * places_mm
         return out + along[:, :, None] * along[:, None, :]
 
+    def pose_covariance(self, points_ct: Points, /) -> Float64[np.ndarray, "n 6 6"] | None:
+        """Of the places to which ``forward`` takes points (mm), as ``covariance_mm2``, and of the
+        organ's turn, without its deformation (rad), both about the camera's axes."""
+        if self.covariance is None or (places_mm2 := self.covariance_mm2(points_ct)) is None:
+            return None
+        out, turn = np.zeros((len(places_mm2), 6, 6)), slice(3, POSE)
+        out[:, :3, 3:] = self.effects(points_ct) @ self.covariance[:, turn]
+        out[:, 3:, 3:] = self.covariance[turn, turn]
+        axes = np.kron(np.eye(2), self.rotation)
+        out = axes @ out @ axes.T
+        for alternative, share in self.alternatives:
+            away_mm = alternative.forward(points_ct) - self.forward(points_ct)
+            away_rad = _rotvec(alternative.rotation @ self.rotation.T)
+            out[:, :3, 3:] += share * away_mm[:, :, None] * away_rad
+            out[:, 3:, 3:] += share * np.outer(away_rad, away_rad)
+        out *= self.std_scale**2
+        out[:, :3, :3], out[:, 3:, :3] = places_mm2, out[:, :3, 3:].transpose(0, 2, 1)
+        return out
+
     def _spread(
         self, points: Float32[np.ndarray, "n 3"], out: Float64[np.ndarray, "n 3 3"]
     ) -> None:
@@ -210,12 +229,16 @@ def seen_from_first(motion: ElasticMotion, camera_from_view: Affine) -> ElasticM
 def blend(a: ElasticMotion, b: ElasticMotion, share: float) -> ElasticMotion:
     """Between two motions of one shape: ``share`` 0 is ``a``, 1 is ``b``, whose covariance it
     has."""
-    from scipy.spatial.transform import Rotation
-
-    turn = Rotation.from_matrix(a.rotation.T @ b.rotation).as_rotvec()
+    turn = _rotvec(a.rotation.T @ b.rotation)
     return replace(
         b,
         rotation=a.rotation @ turned_by(share * turn),
         centre_mm=(1 - share) * a.centre_mm + share * b.centre_mm,
         coefficients=(1 - share) * a.coefficients + share * b.coefficients,
     )
+
+
+def _rotvec(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 3"]:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(rotation).as_rotvec()

@@ -30,6 +30,7 @@ from tumortrack.live.values import (
 from tumortrack_devices.display import MOST_SEEN, seen_points, thinned, wxyz_of
 from tumortrack_devices.extra_status import ExtraStatus
 from tumortrack_devices.network import Rate
+from tumortrack_devices.ros.crtk import crtk_messages
 from tumortrack_devices.ros.messages import MM_PER_M, Messages, Outgoing, PointBlock, xyz
 from tumortrack_devices.ros.sensors import CLOUD, cloud_message, plain_cloud
 from tumortrack_devices.ros.tf import TRANSFORMS, transform_fields
@@ -73,7 +74,8 @@ class ResultMessages:
     are gone.
 
     ``namespace``: of the topics and of tf frames. ``hz``: limit for triangles, the arms' markers
-    and observed points (0: with every result); without ``observed`` those points are left out.
+    and observed points (0: with every result). Without ``observed`` those points are left out, and
+    the words of CRTK: a recording has the image and the report instead.
     """
 
     def __init__(
@@ -115,6 +117,9 @@ class ResultMessages:
             center_mm = result.center_mm(name)
             metres = np.full(3, np.nan) if center_mm is None else center_mm / MM_PER_M
             send(f"{name}/center", PLACE, header=header, point=xyz(metres))
+        if self._observed:
+            touches = self._extra_status.touches
+            out += crtk_messages(result, self._context.parts, touches, self._messages)
         send("/tf", TRANSFORMS, transforms=self._frames(result))
         arms = [] if self._context.controller is None else [_arms_status(result)]
         status = [self._estimate_status(result), *arms]

@@ -134,7 +134,11 @@ def transform_fields(
 
 def pose_of(message: Any) -> Affine | None:
     """Parent from child, mm, of a TransformStamped; None: it is no rigid transform."""
-    shift, turn = message.transform.translation, message.transform.rotation
+    return pose_from(message.transform.translation, message.transform.rotation)
+
+
+def pose_from(shift: Any, turn: Any) -> Affine | None:
+    """A pose in mm from a Vector3 or Point in metres and a Quaternion; None: it is not rigid."""
     numbers = np.array([turn.x, turn.y, turn.z, turn.w, shift.x, shift.y, shift.z])
     if not abs(np.linalg.norm(numbers[:4]) - 1) < _NOT_UNIT or not np.isfinite(numbers).all():
         return None

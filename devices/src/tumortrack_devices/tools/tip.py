@@ -96,14 +96,10 @@ class TipTool(Tool):
         if config.part and config.part not in context.touchable:
             parts = ", ".join(context.touchable)
             raise InputError(f"there is no part {config.part!r}; this organ has {parts}.")
-        published = context.published_frame
-        if frame_id == "" and not published.calibrated:
+        if frame_id == "" and not context.published_frame.calibrated:
             raise InputError("give --frame FILE: where the camera is in the frame of its poses.")
-        if frame_id and frame_id != published.frame_id:
-            raise InputError(
-                f"its poses are in frame {frame_id!r}, and results in {published.frame_id!r}. Give "
-                "--frame FILE with that frame_id: where the camera is there."
-            )
+        if frame_id:
+            self.check_frame(frame_id)
         self._changes = deque[tuple[int, bool]](maxlen=_MOST_CHANGES)
         self._contact = False  # as told last
         self._on, self._began_ns, self._changed_ns = False, 0, -_BOUNCE_NS  # as followed
@@ -111,6 +107,14 @@ class TipTool(Tool):
         self._clicks, self._fault = 0, ""  # of which the next frame tells
         self._point: dict[str, Any] | None = None  # of the CT, that it holds
         self._waiting: list[tuple[int, Piece]] = []  # that no estimate knows yet; since when
+
+    def check_frame(self, frame_id: str) -> None:
+        """Raises InputError: its poses are in another frame than the results."""
+        if frame_id != (published := self.context.published_frame.frame_id):
+            raise InputError(
+                f"its poses are in frame {frame_id!r}, and results in {published!r}. Give "
+                "--frame FILE with that frame_id: where the camera is there."
+            )
 
     def contact(self, stamp_ns: int, touches: bool) -> None:
         """Say whether the tip touches; from one thread."""
