@@ -6,7 +6,7 @@ import os
 import re
 import secrets
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +24,10 @@ from live_objects import (
 from refused import refused
 from ros2_objects import DOMAIN, Frames, own_graph
 from ros2_peer import points_mm
+from tumortrack.core.camera import project
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.core.types import SensorCloud
+from tumortrack.core.geometry import transform_points
+from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.values import Observation, Source
 from tumortrack_devices.ros import sensors
 from tumortrack_devices.ros.bus import Bus, open_bus
@@ -34,10 +36,10 @@ from tumortrack_devices.ros.messages import Messages
 from tumortrack_devices.ros.results import JOINTS, MARKERS, ResultMessages
 from tumortrack_devices.ros.sensors import messages_seen, plain_cloud
 from tumortrack_devices.sinks.moveit import SCENE
-from tumortrack_devices.sinks.ros import ACKNOWLEDGE
+from tumortrack_devices.sinks.ros import ACKNOWLEDGE, ASKED, place_of
 from tumortrack_devices.sinks.ros import Ros2SinkConfig as SinkRos2
 from tumortrack_devices.sources.ros import Ros2SourceConfig as SourceRos2
-from workcell_objects import with_arms, working
+from workcell_objects import TABLE, with_arms, working
 
 needs.module("cyclonedds", "tumortrack-devices, x86-64, Python up to 3.13")
 
@@ -224,7 +226,11 @@ def test_whose_clock(offset_s: int, clock: str, host: bool, bus: Bus) -> None:
     ("name", "frame", "topics"),
     [
         ("tumortrack.rviz", "camera", ["cloud", "meshes"]),
-        ("resection.rviz", "table", ["cloud", "meshes", "observed", "planned", "workcell"]),
+        (
+            "resection.rviz",
+            "table",
+            ["cloud", "links", "meshes", "observed", "planned", "workcell"],
+        ),
     ],
 )
 def test_the_view_for_rviz_shows_what_is_published(
@@ -241,7 +247,9 @@ def test_the_view_for_rviz_shows_what_is_published(
     assert f"Fixed Frame: {frame}" in view
     # A subscriber that wants what was published before does not hear a volatile publisher.
     assert re.findall(r"Transient Local\n.*\n.*\n +Value: (\S+)", view) == (
-        ["/tumortrack/planned", "/robot_description"] if name == "resection.rviz" else []
+        ["/tumortrack/links", "/tumortrack/planned", "/robot_description"]
+        if name == "resection.rviz"
+        else []
     )
 
 
@@ -264,6 +272,72 @@ def test_who_has_seen_what_contradicts_says_so_on_a_topic(bus: Bus, messages: Me
         until(said, "it was heard")
     finally:
         sink.close()
+
+
+def test_a_user_halts_forgets_and_points_at_the_organ(bus: Bus, messages: Messages) -> None:
+    """Arms are halted where some are controlled; elsewhere nobody listens for it."""
+    setting, unarmed, update = with_arms(), small_setting(), working()
+    assert update.observation is not None
+    controls, content = setting.controls, update.observation.content
+    assert isinstance(content, DepthFrame)
+    say = {name: bus.publisher(f"/tumortrack/{name}", kind) for name, kind in ASKED.items()}
+    sink, other = SinkRos2().open(setting), SinkRos2().open(unarmed)
+
+    def until_heard(name: str, heard: Callable[[], object], **content: object) -> None:
+        def said() -> object:
+            say[name](messages.to_bytes(messages.make(ASKED[name], **content)))
+            sink.publish(update)
+            if name != "point_at":  # in the frame of the table, of which it does not know
+                other.publish(small_update())
+            return heard()
+
+        until(said, f"{name} was heard")
+
+    def point_at(frame: str, *place: float) -> np.ndarray:
+        controls.picked_mm = None
+        until_heard(
+            "point_at",
+            lambda: controls.picked_mm is not None,
+            header={"frame_id": frame},
+            point=dict(zip("xyz", place, strict=True)),
+        )
+        return controls.picked_mm
+
+    try:
+        assert not controls.aborted.is_set()
+        until_heard("halt", controls.aborted.is_set)
+        until_heard(
+            "forget", lambda: all(one.controls.forgotten.is_set() for one in (setting, unarmed))
+        )
+        assert not unarmed.controls.aborted.is_set()
+        np.testing.assert_allclose(point_at("table", 0.01, -0.02, 0.0), [10, -20, 0])
+        np.testing.assert_allclose(point_at("camera", 0.01, -0.02, 0.13), [10, 20, 30], atol=1e-9)
+        row, column = np.argwhere(np.isfinite(content.depth_mm))[7]
+        (there_mm,) = transform_points(
+            np.linalg.inv(TABLE.published_from_camera), point_at("camera", column, row, 0.0)[None]
+        )
+        pixel, depth_mm = project(there_mm[None], content.intrinsics)
+        np.testing.assert_allclose([*pixel[0], depth_mm[0]], [column, row,
+                                   content.depth_mm[row, column]], atol=1e-4)  # fmt: skip
+    finally:
+        sink.close()
+        other.close()
+
+
+@pytest.mark.parametrize(
+    ("place", "frame", "named"),
+    [
+        ((0.0, 0.0, 0.1), "elsewhere", "elsewhere"),
+        ((np.nan, 0.0, 0.1), "table", "nan"),
+        ((1e9, 0.0, 0.0), "camera", "64 x 48"),
+        ((-1.0, 3.0, 0.0), "camera", "-1"),
+    ],
+)
+def test_what_is_no_place_of_the_organ_is_refused(
+    place: tuple[float, float, float], frame: str, named: str
+) -> None:
+    with refused(InputError, named):
+        place_of(np.array(place), frame, working())
 
 
 def test_other_types_are_refused(bus: Bus) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import signal
 import struct
 import sys
 import xml.etree.ElementTree as ET
@@ -39,7 +40,7 @@ from tumortrack_devices.ros.results import ResultMessages
 from tumortrack_devices.ros.sensors import COMPRESSED, image_of
 from tumortrack_devices.ros.tf import TRANSFORMS, pose_of
 from tumortrack_devices.sinks.moveit import SCENE, coarser, widened_hull
-from tumortrack_devices.sinks.ros import ACKNOWLEDGE
+from tumortrack_devices.sinks.ros import ACKNOWLEDGE, ASKED
 
 MESSAGES = Messages()
 QUARTER = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -275,7 +276,7 @@ def test_a_parameter_that_tracking_refuses_is_set_back_and_it_goes_on(tmp_path):
         with process(*command, environment=environment) as node, closing(open_bus("dds")) as bus:
             topic, kind = ACKNOWLEDGE
             acknowledged = bus.subscriber(f"/tumortrack/{topic}", kind)
-            with peer("acknowledge", 2, by=RCLPY) as other:  # as the sink would hear it
+            with peer("ask", "acknowledge", 2, by=RCLPY) as other:  # as the sink would hear it
                 calls = [json.loads(other.line())["successful"] for _ in range(2)]
                 bus.wait(PATIENCE_S)
             assert calls[-1]
@@ -293,6 +294,64 @@ def test_a_parameter_that_tracking_refuses_is_set_back_and_it_goes_on(tmp_path):
     assert (back["moving"], back["stale"]) == ("", 0.5)
     said = [line.partition("--moving ")[2] for line in started.read_text().splitlines()]
     assert [words.split()[:1] for words in said] == [[], ["nonsense"], [], ["over"]]
+
+
+def test_the_node_is_one_whose_life_others_manage(tmp_path):
+    """By a lifecycle client of the real rclpy: it tracks while it is active, and refuses to change
+    what it is about."""
+    started = tmp_path / "started"
+    program = tmp_path / "tumortrack"
+    ended = "trap 'echo ended >> {0}; exit 0' INT; while :; do sleep 0.1; done"
+    program.write_text(f'#!/bin/sh\necho "$*" >> {started}\n{ended.format(started)}\n')
+    program.chmod(0o755)
+    begin = "from tumortrack_ros.track_node import main; main()"
+    given = {"executable": program, "source": "ros2:/depth", "autostart": "false"}
+    options = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
+    command = sys.executable, "-c", begin, "--ros-args", *options
+
+    def told(*words: str) -> list[dict]:
+        with peer(*words, by=RCLPY) as other:
+            count = int(words[2]) if words[0] == "ask" else len(words) - (words[0] == "set")
+            lines = [json.loads(other.line()) for _ in range(count)]
+            assert other.ended() == 0
+            return lines
+
+    with own_graph():
+        environment = clients.environment("ros-jazzy-rclpy")
+        environment["PYTHONPATH"] += f"{os.pathsep}{PACKAGE}"
+        with process(*command, environment=environment) as node:
+            first, *early = told("change", "configure", "activate")
+            assert "tumortrack" in first["nodes"]
+            assert [(one["done"], one["state"]) for one in early] == 2 * [(False, "unconfigured")]
+            assert told("set", "model=M")[0]["successful"]
+            _, *made = told("change", "configure", "activate")
+            assert [one["state"] for one in made] == ["inactive", "active"]
+            until(started.exists, "tracking")
+            answers = told(
+                "set", "model=other", "stale=-5", "stale=nan", "side=up", "smoothing=0.2"
+            )
+            assert [one["successful"] for one in answers] == [False] * 4 + [True]
+            named = ("model", "stale", "stale", "side")
+            assert all(name in one["reason"] for name, one in zip(named, answers, strict=False))
+            until(lambda: started.read_text().count("--rescan") == 2, "tracking with the new value")
+            assert not told("ask", "halt", "1")[0]["successful"]  # no arms: nobody listens
+            with closing(open_bus("dds")) as bus:
+                heard = bus.subscriber("/tumortrack/forget", ASKED["forget"])
+                asked = told("ask", "forget", "4")
+                bus.wait(PATIENCE_S)
+                assert asked[-1]["successful"]
+                assert heard.take()
+            with peer("change", "1", "deactivate", "cleanup", by=RCLPY) as other:
+                _, *made = (json.loads(other.line()) for _ in range(3))
+            assert [one["state"] for one in made] == ["inactive", "unconfigured"]
+            assert node.running()
+            *runs, last = started.read_text().splitlines()
+            assert last == "ended"
+            assert "--smoothing 0.2" in runs[-1]
+            assert told("set", "model=other")[0]["successful"]
+            assert told("change", "shutdown")[1]["state"] == "finalized"
+            node.signal(signal.SIGINT)
+            assert node.ended() == 0
 
 
 def test_the_package_names_this_version():

@@ -19,6 +19,7 @@ from tumortrack_devices.igtl.message import unpack_transform
 from tumortrack_devices.ros.messages import Messages, stamp_of
 from tumortrack_devices.ros.results import ResultMessages
 from tumortrack_devices.ros.sensors import cloud_of
+from tumortrack_devices.ros.tf import pose_of
 from tumortrack_devices.sinks.openigtlink import OpenIgtLinkSinkConfig
 from workcell_objects import CUT, REASON, TABLE, virtual, with_arms, workcell, working
 
@@ -40,6 +41,22 @@ def less(update: TrackingResult, *names: str) -> TrackingResult:
     return replace(update, control=replace(cell, shapes=shapes, lines=lines))
 
 
+def assert_drawn(links: list, tf: object, shapes: tuple[RigidShape, ...]) -> None:
+    """As RViz does it, a marker's pose in the frame of its header, and that in the table's: each
+    corner of each triangle is where the arms have it."""
+    frames = {one.child_frame_id: one for one in tf.transforms}
+    for marker, shape in zip(links, shapes, strict=True):
+        place = frames[marker.header.frame_id]
+        assert place.header.frame_id == "table"
+        p, q = marker.pose.position, marker.pose.orientation
+        turn = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+        shown = pose_of(place) @ rigid(turn, np.array([p.x, p.y, p.z]) * 1000)
+        corners_mm = transform_points(shown, np.vstack(list(marker.points)) * 1000)
+        corners_in_shape = shape.mesh.vertices_mm[shape.mesh.faces.ravel()]
+        expected = transform_points(shape.published_from_shape, corners_in_shape)
+        np.testing.assert_allclose(corners_mm, expected, atol=1e-6)
+
+
 # ROS
 
 
@@ -51,20 +68,29 @@ def test_joints_and_markers_say_where_everything_stands():
     assert (stamp_of(joints.header), joints.header.frame_id) == (update.stamp_ns, "table")
 
     markers = {m.ns: m for m in out["workcell"].markers}
-    assert list(markers) == [*NAMES, "cut/1", "cut/2", "state"]
+    assert list(markers) == ["cut/1", "cut/2", "state"]
     assert {stamp_of(m.header) for m in markers.values()} == {update.stamp_ns}
     assert all(m.action == m.ADD and m.lifetime.sec > 0 for m in markers.values())
-    for shape in cell.shapes:
-        marker, way = markers[shape.name], shape.published_from_shape
-        p, q = marker.pose.position, marker.pose.orientation
-        shown = rigid(
-            Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), np.array([p.x, p.y, p.z]) * 1000
-        )
-        corners_mm = transform_points(shown, np.vstack(list(marker.points)) * 1000)
-        expected = transform_points(way, shape.mesh.vertices_mm[shape.mesh.faces.ravel()])
-        np.testing.assert_allclose(corners_mm, expected, atol=1e-6)
+    first, *links = out["links"].markers
+    assert first.action == first.DELETEALL
+    assert [m.ns for m in links] == NAMES
+    for shape, marker in zip(cell.shapes, links, strict=True):
         assert marker.type == marker.TRIANGLE_LIST
         assert (marker.color.r, marker.color.a) == (shape.colour[0] / 255, 1.0)
+        assert (marker.frame_locked, marker.lifetime.sec) == (True, 0)  # until it is told otherwise
+    assert_drawn(links, out["/tf"], cell.shapes)
+    # Later transforms carry what was drawn before along.
+    results = ResultMessages(HUMBLE, with_arms())
+    links = sent(update, results)["links"].markers[1:]
+    way = rigid(Rotation.from_rotvec([0.3, -0.2, 1.0]).as_matrix(), np.array([5.0, -70.0, 30.0]))
+    moved = tuple(
+        replace(shape, published_from_shape=way @ shape.published_from_shape)
+        for shape in cell.shapes
+    )
+    out = sent(replace(working(4), control=replace(cell, shapes=moved)), results)
+    assert "links" not in out
+    assert_drawn(links, out["/tf"], moved)
+    assert {stamp_of(one.header) for one in out["/tf"].transforms} == {working(4).stamp_ns}
     cut = markers["cut/1"]
     np.testing.assert_allclose(np.vstack(list(cut.points)) * 1000, cell.lines[0].points_mm)
     assert (cut.type, cut.scale.x) == (cut.LINE_STRIP, 0.002)
@@ -83,7 +109,8 @@ def test_joints_and_markers_say_where_everything_stands():
 def test_arms_are_told_of_without_an_estimate_and_why_they_stand():
     results = ResultMessages(HUMBLE, with_arms())
     out = sent(virtual(halted="the tumor moved by 6 mm"), results)
-    assert len(out["workcell"].markers) == len(NAMES) + 3
+    assert len(out["workcell"].markers) == 3
+    assert len(out["links"].markers) == 1 + len(NAMES)
     assert [m.action for m in out["meshes"].markers] == [3]  # DELETEALL: no estimate
     first, *more = out["workcell"].markers[-1].text.splitlines()
     below = sent(working())["workcell"].markers[-1].pose.position.z
@@ -102,14 +129,16 @@ def test_arms_are_told_of_without_an_estimate_and_why_they_stand():
 
 def test_markers_keep_their_rate_and_changes_come_at_once():
     cell = ResultMessages(HUMBLE, with_arms(), hz=0.01)
-    assert len(sent(working(0), cell)["workcell"].markers) == len(NAMES) + 3
+    assert len(sent(working(0), cell)["workcell"].markers) == 3
     later = sent(working(1, 0.2), cell)
     assert "workcell" not in later
     assert later["joint_states"].position[0] == pytest.approx(0.04)  # joints come each time
     # Whoever is slow gets the newest message alone: each is whole.
-    markers = sent(less(working(2, 0.3), "holder/tip", "cut/2"), cell)["workcell"].markers
-    assert [(m.ns, m.action) for m in markers[:2]] == [("cut/2", 2), ("holder/tip", 2)]
-    assert [m.ns for m in markers[2:]] == [*NAMES[:-1], "cut/1", "state"]
+    out = sent(less(working(2, 0.3), "holder/tip", "cut/2"), cell)
+    assert [(m.ns, m.action) for m in out["workcell"].markers[:1]] == [("cut/2", 2)]
+    assert [m.ns for m in out["workcell"].markers[1:]] == ["cut/1", "state"]
+    assert [m.ns for m in out["links"].markers[1:]] == NAMES[:-1]
+    assert out["links"].markers[0].action == 3  # DELETEALL
     cut = less(working(2, 0.3), "holder/tip", "cut/2")  # begins: the electrode's colour changes
     assert cut.control is not None
     shapes = tuple(
@@ -117,13 +146,16 @@ def test_markers_keep_their_rate_and_changes_come_at_once():
         for shape in cut.control.shapes
     )
     cut = replace(cut, control=replace(cut.control, shapes=shapes))
-    assert "workcell" in sent(cut, cell)
-    assert "workcell" not in sent(cut, cell)
+    (red,) = (m for m in sent(cut, cell)["links"].markers if m.ns == "cutter/tip")
+    assert (red.color.r, red.color.b) == (pytest.approx(70 / 255), 1.0)
+    assert "links" not in sent(cut, cell)
     halted = less(working(3, 0.3, "hidden"), "holder/tip", "cut/2")
     assert sent(halted, cell)["workcell"].markers[-1].text == "sweep 1, halted: hidden"
     assert "workcell" not in sent(halted, cell)
-    (all_gone,) = sent(small_update(2, frames=TABLE), cell)["workcell"].markers
-    assert all_gone.action == all_gone.DELETEALL
+    gone = sent(small_update(2, frames=TABLE), cell)
+    for topic in ("workcell", "links"):
+        (all_gone,) = gone[topic].markers
+        assert all_gone.action == all_gone.DELETEALL
     nothing = sent(replace(working(3), control=None), cell)
     assert len(nothing["joint_states"].name) == 0
     assert nothing["diagnostics"].status[1].level == 3  # STALE
@@ -139,7 +171,7 @@ def test_what_the_camera_saw_is_sent_in_the_frame_of_the_arms():
     assert np.sort(points_mm[:, 2]) == pytest.approx(
         np.sort(160 - depth_mm[np.isfinite(depth_mm)]), abs=1e-3
     )
-    arms = {"workcell", "joint_states", "observed", "planned"}
+    arms = {"workcell", "joint_states", "observed", "planned", "links"}
     assert not arms & sent(update, ResultMessages(HUMBLE, small_setting())).keys()
     slow = ResultMessages(HUMBLE, with_arms(), hz=0.01)
     assert "observed" in sent(update, slow)
@@ -167,9 +199,11 @@ def test_what_neither_moves_nor_deforms_is_sent_once_and_kept_for_latecomers():
     for n in (1, 2):
         later = out(n, *planned)
         assert "planned" not in later
-        moving = [marker.ns for marker in later["workcell"].message.markers]
-        assert set(NAMES) < set(moving)
-        assert not set(names[1:]) & set(moving)
+        moving = {one.child_frame_id for one in later["/tf"].message.transforms}
+        assert {f"tumortrack/{name}" for name in NAMES} < moving
+        assert not {f"tumortrack/{name}" for name in names[1:]} & moving
+    links = [marker.ns for marker in first["links"].message.markers]
+    assert links[1:] == NAMES
     (gone,) = out(3)["planned"].message.markers
     assert gone.action == gone.DELETEALL
 

@@ -10,9 +10,10 @@ from clock import PATIENCE_S, Clock, until
 from reports import poor
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import FollowOptions
+from tumortrack.core.evidence import Touch
 from tumortrack.core.types import SensorCloud
 from tumortrack.live.loop import Loop, LoopConfig
-from tumortrack.live.values import Controls, PublishedFrame, SinkContext
+from tumortrack.live.values import Controls, Observation, PublishedFrame, SinkContext
 from tumortrack.live.workers import SourceWorker
 from tumortrack.segmentation import RegionConfig
 from tumortrack.tracking.follower import Follower, FollowerConfig
@@ -189,3 +190,24 @@ def test_a_pick_makes_the_loop_look_again_moves_along_and_is_forgotten_when_lost
     reader.close()
     assert "search" in told[1][0].estimate.report.timings  # looked for as in a first frame
     assert [pick is not None for _, pick in told] == [True] * 4 + [False]
+
+
+def test_who_forgets_gets_a_search_without_what_was_known_before(tracker, stages):
+    controls, told = Controls(), []
+    first, *more = moving(stages[0], 5)
+    on_it = tuple(np.median(first.points_mm, axis=0).tolist())
+    touched = Observation(first, first.stamp_ns, evidence=(Touch(place_mm=on_it, std_mm=3.0),))
+
+    def hear(result):
+        told.append((result.estimate.report, result.estimate.evidence))
+        if len(told) == 3:
+            controls.forget()
+
+    setting = SinkContext(tracker.model.parts, PublishedFrame(), tracker.anatomy_ct, controls)
+    reader = SourceWorker(once(Tape(touched, *more)))
+    Loop(tracker, setting, CONFIG).run(reader, [], hear)
+    reader.close()
+    assert [len(known) for _, known in told] == [1, 1, 1, 0, 0]
+    searched = ["search" in report.timings for report, _ in told]
+    assert searched == [True, False, False, True, False]
+    assert not controls.forgotten.is_set()

@@ -2,7 +2,9 @@
 
 rclpy_peer.py send image HZ SECONDS      a depth camera
 rclpy_peer.py hear SECONDS               a line for every message of the sink
-rclpy_peer.py acknowledge COUNT           calls of the node's service
+rclpy_peer.py ask NAME COUNT              calls of the node's service
+rclpy_peer.py change NAME ...            transitions of the node /tumortrack, and its state before
+                                         and after each
 rclpy_peer.py set NAME=VALUE ...         parameters of the node /tumortrack, one after the other
 """
 
@@ -18,6 +20,8 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
@@ -31,6 +35,7 @@ from live_objects import CAMERA, PARTS
 from ros2_peer import MASK, frame_numbered
 
 KEPT = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+NUMBERS = ("smoothing", "stale")
 KINDS = {"cloud": PointCloud2, "meshes": MarkerArray, "diagnostics": DiagnosticArray}
 
 
@@ -101,7 +106,7 @@ def put(node: Node, words: list[str]) -> None:
         return future.result()
 
     for name, value in (word.split("=") for word in words):
-        given = Parameter(name, value=float(value) if name == "stale" else value)
+        given = Parameter(name, value=float(value) if name in NUMBERS else value)
         (result,) = answer(client.set_parameters([given])).results
         said = {"successful": result.successful, "reason": result.reason}
         print(json.dumps(said), flush=True)
@@ -114,9 +119,36 @@ def put(node: Node, words: list[str]) -> None:
             time.sleep(0.05)
 
 
-def acknowledge(node: Node, count: int) -> None:
+def change(node: Node, names: list[str]) -> None:
+    """A line for each transition: whether it was made, and in which state the node is; and first
+    one with its state, and the names of all nodes. rclpy never answers a number (the transition's
+    id) that the state does not have: it is sent, and no more."""
+    states = node.create_client(GetState, "/tumortrack/get_state")
+    changes = node.create_client(ChangeState, "/tumortrack/change_state")
+
+    def answer(client: Any, request: Any) -> Any:
+        client.wait_for_service()
+        future = client.call_async(request)
+        rclpy.spin_until_future_complete(node, future)
+        return future.result()
+
+    def state() -> str:
+        return answer(states, GetState.Request()).current_state.label
+
+    said: dict[str, Any] = {"state": state(), "nodes": node.get_node_names()}
+    print(json.dumps(said), flush=True)
+    for name in names:
+        if name.isdigit():
+            changes.call_async(ChangeState.Request(transition=Transition(id=int(name))))
+            continue
+        request = ChangeState.Request(transition=Transition(label=name))
+        done = answer(changes, request).success
+        print(json.dumps({"name": name, "done": done, "state": state()}), flush=True)
+
+
+def ask(node: Node, name: str, count: int) -> None:
     """A line for each answer, half a second apart."""
-    client = node.create_client(Trigger, "/tumortrack/acknowledge")
+    client = node.create_client(Trigger, f"/tumortrack/{name}")
     client.wait_for_service()
     for _ in range(count):
         future = client.call_async(Trigger.Request())
@@ -137,7 +169,9 @@ if __name__ == "__main__":
         send(here, *map(float, sys.argv[3:]))
     elif sys.argv[1] == "set":
         put(here, sys.argv[2:])
-    elif sys.argv[1] == "acknowledge":
-        acknowledge(here, int(sys.argv[2]))
+    elif sys.argv[1] == "change":
+        change(here, sys.argv[2:])
+    elif sys.argv[1] == "ask":
+        ask(here, sys.argv[2], int(sys.argv[3]))
     else:
         hear(here, float(sys.argv[2]))

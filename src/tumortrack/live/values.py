@@ -350,7 +350,8 @@ class Controls:
     ``clicks``: colours at clicks in pictures; ``tissue_classifier``: the classifier learned from
     them, if they can be separated; ``colour``: its state in words. ``touched``: names of tools of
     which the user says that they touch now, or take, or let go. ``acknowledged``: evidence that
-    contradicts was wrong."""
+    contradicts was wrong. ``forgotten``: by ``forget``, also the last estimate and all evidence:
+    the organ is searched for again."""
 
     picked_mm: Float64[np.ndarray, " 3"] | None = None
     aborted: threading.Event = field(default_factory=threading.Event)
@@ -359,6 +360,7 @@ class Controls:
     colour: str = ""
     touched: deque[str] = field(default_factory=deque)
     acknowledged: threading.Event = field(default_factory=threading.Event)
+    forgotten: threading.Event = field(default_factory=threading.Event)
 
     def click(self, seen: Observation, place_mm: Float[np.ndarray, " 3"], organ: bool) -> None:
         """The user clicked on this place (camera frame): on the ``organ``, or beside it. Raises
@@ -389,6 +391,7 @@ class Controls:
 
     def forget(self) -> None:
         self.picked_mm, self.clicks, self.tissue_classifier, self.colour = None, (), None, ""
+        self.forgotten.set()
 
 
 @dataclass(frozen=True, eq=False)

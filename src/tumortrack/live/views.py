@@ -227,6 +227,10 @@ class ViewsLocator:
         if controls.acknowledged.is_set():
             controls.acknowledged.clear()
             self._follower.disputes.acknowledge()
+        if controls.forgotten.is_set():
+            controls.forgotten.clear()
+            self._follower.forget()
+            self._follower.disputes.acknowledge()  # it is gone with the rest of the evidence
         if (
             controls.tissue_classifier is not self._tissue_classifier
         ):  # what was taken for the organ may be wrong

@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import re
+import secrets
 import threading
 import time
 from collections import deque
@@ -117,7 +118,8 @@ class RclpyBus:
         self.messages, self._qos = messages, qos
         self._context = rclpy.Context()
         rclpy.init(args=[], context=self._context)  # its own context: no signal handlers
-        self._node = rclpy.create_node("tumortrack", context=self._context)
+        name = f"tumortrack_{secrets.token_hex(3)}"  # each its own: a run has several
+        self._node = rclpy.create_node(name, context=self._context)
         self._executor = executors.SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._lock, self._closed = threading.Lock(), False  # held while spinning: close waits

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Sequence
 from textwrap import fill
 from typing import Any
 
@@ -27,7 +26,7 @@ from tumortrack.live.values import (
     TrackingResult,
     TransformedEstimate,
 )
-from tumortrack_devices.display import MOST_SEEN, seen_points, thinned, wxyz_of
+from tumortrack_devices.display import MOST_SEEN, seen_points, thinned
 from tumortrack_devices.extra_status import ExtraStatus
 from tumortrack_devices.network import Rate
 from tumortrack_devices.ros.crtk import crtk_messages
@@ -39,7 +38,9 @@ MARKERS = "visualization_msgs/msg/MarkerArray"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 PLACE = "geometry_msgs/msg/PointStamped"
 JOINTS = "sensor_msgs/msg/JointState"
-LATCHED = "planned"  # the topic that is sent when it changes, and kept for who comes later
+# Topics of what does not deform, sent when it changes and kept for who comes later: what stands
+# still, and what moves, each surface in a frame of its own
+PLANNED, LINKS = LATCHED = "planned", "links"
 
 _STATE = "state"  # the marker namespace of the arms' text
 _DELETE, _DELETE_ALL = 2, 3  # Marker's actions
@@ -94,7 +95,7 @@ class ResultMessages:
         self._extra_status = ExtraStatus()
         self._spots_shown, self._shown = set[tuple[str, int]](), set[str]()
         self._shown_state: tuple[object, ...] | None = None
-        self._planned: tuple[Mesh, ...] | None = None  # sent last
+        self._latched = dict[str, object]()  # what was sent last
 
     def messages(self, result: TrackingResult) -> list[Outgoing]:
         """The messages of one result; docs/ros.md describes each topic. Raises InputError for a
@@ -106,13 +107,13 @@ class ResultMessages:
         def send(suffix: str, kind: str, **values: Any) -> None:
             out.append(Outgoing(suffix, kind, self._messages.make(kind, **values)))
 
-        def send_markers(suffix: str, markers: list[dict[str, Any]], seconds: int) -> None:
-            common = {"header": header, "lifetime": {"sec": seconds}}
+        def send_markers(suffix: str, markers: list[dict[str, Any]], **common: Any) -> None:
+            common = {"header": header, **common}
             send(suffix, MARKERS, markers=[common | marker for marker in markers])
 
         cloud = _labelled_cloud(result.transformed, header, self._messages)
         out.append(Outgoing("cloud", CLOUD, cloud))
-        send_markers("meshes", self._organ(result), _LIFETIME_S)
+        send_markers("meshes", self._organ(result), lifetime={"sec": _LIFETIME_S})
         for name in self._context.parts:
             center_mm = result.center_mm(name)
             metres = np.full(3, np.nan) if center_mm is None else center_mm / MM_PER_M
@@ -134,25 +135,30 @@ class ResultMessages:
         angles = np.array(list(joints.values()), np.float64)
         send("joint_states", JOINTS, header=header, name=list(joints), position=angles)
         if (markers := self._workcell(result)) is not None:
-            send_markers("workcell", markers, _LIFETIME_S)
-        if (markers := self._as_planned(result)) is not None:
-            send_markers(LATCHED, markers, 0)
+            send_markers("workcell", markers, lifetime={"sec": _LIFETIME_S})
+        for suffix in LATCHED:
+            if (markers := self._rigid(suffix, result)) is not None:
+                send_markers(suffix, markers, frame_locked=True)  # at any time, not their stamp's
         if self._observed and (points := self._points(result)) is not None:
             seen = plain_cloud(SensorCloud(points, result.stamp_ns), header, self._messages)
             out.append(Outgoing("observed", CLOUD, seen))
         return out
 
     def _frames(self, result: TrackingResult) -> list[dict[str, Any]]:
-        """A transform to each part, of good estimates only: tf can't mark one as poor."""
-        if result.estimate is None or result.quality != "good":
-            return []
+        """A transform to each part, of good estimates only: tf can't mark one as poor; and to each
+        shape that moves."""
+        poses = {shape.name: shape.published_from_shape for shape in _shapes(result, LINKS)}
+        if result.estimate is not None and result.quality == "good":
+            parts = {name: result.part_pose(name) for name in result.estimate.meshes}
+            poses = {name: pose for name, pose in parts.items() if pose is not None} | poses
         stamp_ns, parent = result.stamp_ns, result.published_frame.frame_id
-        poses = {name: result.part_pose(name) for name in result.estimate.meshes}
         return [
-            transform_fields(self._messages, stamp_ns, parent, f"{self._namespace}/{name}", pose)
+            transform_fields(self._messages, stamp_ns, parent, self._frame_of(name), pose)
             for name, pose in poses.items()
-            if pose is not None
         ]
+
+    def _frame_of(self, name: str) -> str:
+        return f"{self._namespace}/{name}"
 
     def _organ(self, result: TrackingResult) -> list[dict[str, Any]]:
         """Triangles per part, spots and a text of the quality; without an estimate all are
@@ -200,30 +206,36 @@ class ResultMessages:
         if control is None:
             self._shown, self._shown_state = set(), None
             return [{"action": _DELETE_ALL}]
-        shapes = [shape for shape in control.shapes if not shape.still]
-        names = {_STATE, *(s.name for s in shapes), *(line.name for line in control.drawn_lines)}
+        names = {_STATE, *(line.name for line in control.drawn_lines)}
         gone, self._shown = self._shown - names, names
-        # Not the reason, which changes with each frame
-        state = control.state, bool(control.stopped), [shape.colour for shape in shapes]
+        state = control.state, bool(control.stopped)  # not the reason: it changes with each frame
         changed, self._shown_state = gone or state != self._shown_state, state
         if not self._markers_rate.due() and not changed:
             return None
         markers: list[dict[str, Any]] = [{"ns": name, "action": _DELETE} for name in sorted(gone)]
-        markers += _shape_markers(shapes)
         for line in control.drawn_lines:
             scale, points = {"x": line.width_mm / MM_PER_M}, PointBlock(line.points_mm / MM_PER_M)
             markers.append(_marker(line.name, _LINE, line.colour, scale=scale, points=points))
         return [*markers, _state_text(result, control)]
 
-    def _as_planned(self, result: TrackingResult) -> list[dict[str, Any]] | None:
-        """What neither moves nor deforms, two thirds of all triangles: only when it changes."""
-        every = () if result.control is None else result.control.shapes
-        shapes = [shape for shape in every if shape.still]
-        meshes = tuple(shape.mesh for shape in shapes)
-        if self._planned is not None and list(map(id, meshes)) == list(map(id, self._planned)):
+    def _rigid(self, suffix: str, result: TrackingResult) -> list[dict[str, Any]] | None:
+        """All surfaces that do not deform and belong on this topic; None: it has them already.
+        Those that move are drawn at the origin of their own frames."""
+        shapes, parent = _shapes(result, suffix), result.published_frame.frame_id
+        now = parent, [(shape.name, shape.mesh, shape.colour, shape.opacity) for shape in shapes]
+        if self._latched.get(suffix) == now:
             return None
-        self._planned = meshes
-        return [{"action": _DELETE_ALL}, *_shape_markers(shapes)]
+        self._latched[suffix] = now
+        markers: list[dict[str, Any]] = [{"action": _DELETE_ALL}]
+        for shape in shapes:
+            mesh, frame = shape.mesh, self._frame_of(shape.name)
+            if suffix == PLANNED:
+                corners_mm = transform_points(shape.published_from_shape, mesh.vertices_mm)
+                mesh, frame = mesh.with_vertices(corners_mm), parent
+            header = {"header": self._messages.header(result.stamp_ns, frame)}
+            marker = _triangles(shape.name, mesh, shape.colour, shape.opacity)
+            markers.append(header | marker)
+        return markers
 
     def _points(self, result: TrackingResult) -> Float32[np.ndarray, "n 3"] | None:
         """The observed points, published frame; None: they are not due."""
@@ -325,17 +337,10 @@ def _describe(control: ControlState) -> str:
     return control.state
 
 
-def _shape_markers(shapes: Sequence[RigidShape]) -> list[dict[str, Any]]:
-    markers, turns = [], [shape.published_from_shape[:3, :3] for shape in shapes]
-    quaternions = wxyz_of(np.array(turns)) if turns else ()  # all at once: 5 times faster
-    for shape, wxyz in zip(shapes, quaternions, strict=True):
-        marker = _triangles(shape.name, shape.mesh, shape.colour, shape.opacity)
-        marker["pose"] = {
-            "position": xyz(shape.published_from_shape[:3, 3] / MM_PER_M),
-            "orientation": dict(zip("wxyz", wxyz.tolist(), strict=True)),
-        }
-        markers.append(marker)
-    return markers
+def _shapes(result: TrackingResult, suffix: str) -> list[RigidShape]:
+    """Those that belong on a latched topic."""
+    every = () if result.control is None else result.control.shapes
+    return [shape for shape in every if shape.still == (suffix == PLANNED)]
 
 
 def _triangles(ns: str, mesh: Mesh, colour: Colour, opacity: float) -> dict[str, Any]:

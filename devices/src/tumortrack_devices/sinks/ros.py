@@ -4,16 +4,25 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from tumortrack.core.errors import TumortrackError
-from tumortrack.core.geometry import Affine
+import numpy as np
+from jaxtyping import Float64
+
+from tumortrack.core.camera import deproject_pixels
+from tumortrack.core.errors import InputError, TumortrackError
+from tumortrack.core.geometry import Affine, transform_points
+from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 from tumortrack_devices.ros.bus import Bus, Publish, Via, check_topic, open_bus
-from tumortrack_devices.ros.results import LATCHED, ResultMessages
+from tumortrack_devices.ros.messages import MM_PER_M
+from tumortrack_devices.ros.results import LATCHED, PLACE, ResultMessages
 from tumortrack_devices.ros.sensors import CAMERA_FRAME
 from tumortrack_devices.ros.tf import TRANSFORMS, transform_fields
 
 _FLUSH_S = 0.2  # for the last messages to leave
-ACKNOWLEDGE = "acknowledge", "std_msgs/msg/Empty"
+# What a user asks for, by topic under the namespace; ``halt`` where arms are controlled
+_EMPTY = "std_msgs/msg/Empty"
+ACKNOWLEDGE, HALT, POINT_AT = ("acknowledge", _EMPTY), ("halt", _EMPTY), ("point_at", PLACE)
+ASKED = dict((ACKNOWLEDGE, ("forget", _EMPTY), HALT, POINT_AT))
 
 
 class Ros2SinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ros2"):
@@ -38,8 +47,8 @@ class Ros2SinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ros2"):
 
 class RosSink:
     """Subscribers get the newest result; slow ones miss some and delay nobody. At the end, and
-    whenever there is no estimate, all topics say so. A message on ``ACKNOWLEDGE`` says that the
-    user has seen what contradicts the answer."""
+    whenever there is no estimate, all topics say so. What is asked for on the topics ``ASKED`` goes
+    to the loop's controls with the next result."""
 
     def __init__(self, config: Ros2SinkConfig, context: SinkContext, bus: Bus) -> None:
         self._bus, self.notes = bus, (bus.note,)
@@ -50,23 +59,31 @@ class RosSink:
         self._static: Publish | None = None
         if config.camera_tf and not context.published_frame.moves:
             self._static = bus.publisher("/tf_static", TRANSFORMS, latched=True)
-        topic, kind = ACKNOWLEDGE
-        self._seen = bus.subscriber(f"{config.namespace}/{topic}", kind)
-        self._acknowledged = context.controls.acknowledged
+        self._controls, arms = context.controls, context.controller is not None
+        self._asked = {
+            name: bus.subscriber(f"{config.namespace}/{name}", kind)
+            for name, kind in ASKED.items()
+            if arms or name != "halt"
+        }
         nothing = TrackingResult(sequence=0, stamp_ns=0, published_frame=context.published_frame)
         self._publishers = {
             out.suffix: bus.publisher(
-                out.topic(config.namespace), out.message_type, out.suffix == LATCHED
+                out.topic(config.namespace), out.message_type, out.suffix in LATCHED
             )
             for out in self._results.messages(nothing)
         }
 
     def publish(self, result: TrackingResult) -> None:
-        """Send it on every topic, also on the others if one fails."""
+        """Do what was asked for, and send the result. Raises TumortrackError: a message was not
+        sent; InputError: what was asked for cannot be done."""
         self._last = result
-        self._bus.wait(0.0)
-        if self._seen.take():
-            self._acknowledged.set()
+        try:
+            self._obey(result)
+        finally:
+            self._send(result)
+
+    def _send(self, result: TrackingResult) -> None:
+        """On every topic, also on the others if one fails."""
         self._publish_cameras(result)
         failed: list[str] = []
         for suffix, _, message in self._results.messages(result):
@@ -76,6 +93,21 @@ class RosSink:
                 failed.append(str(error))
         if failed:
             raise TumortrackError(" ".join(failed))
+
+    def _obey(self, result: TrackingResult) -> None:
+        """Raises InputError: where the organ is said to be is no place."""
+        self._bus.wait(0.0)
+        asked = {name: subscriber.take() for name, subscriber in self._asked.items()}
+        if asked["acknowledge"]:
+            self._controls.acknowledged.set()
+        if asked.get("halt"):
+            self._controls.aborted.set()
+        if asked["forget"]:
+            self._controls.forget()
+        for raw in asked["point_at"][-1:]:
+            said = self._bus.messages.from_bytes(raw, PLACE)
+            place = np.array([said.point.x, said.point.y, said.point.z])
+            self._controls.picked_mm = place_of(place, said.header.frame_id, result)
 
     def _publish_cameras(self, result: TrackingResult) -> None:
         """All known poses in one latched message, whenever there is another camera."""
@@ -104,8 +136,43 @@ class RosSink:
             if last is not None:
                 frame, reason = last.published_frame, "tracking has ended"
                 number, stamp_ns = last.sequence + 1, last.stamp_ns + 1
-                self.publish(TrackingResult(number, stamp_ns, reason=reason, published_frame=frame))
-                self._last = None
+                self._send(TrackingResult(number, stamp_ns, reason=reason, published_frame=frame))
                 self._bus.flush(_FLUSH_S)
         finally:
             self._bus.close()
+
+
+def place_of(
+    place: Float64[np.ndarray, " 3"], frame_id: str, result: TrackingResult
+) -> Float64[np.ndarray, " 3"]:
+    """A place on the organ in the published frame, mm. ``place``: in that frame or in the camera's,
+    m; in the camera's with z = 0 column and row of a pixel. Raises InputError."""
+    seen, published = result.observation, result.published_frame
+    camera = (None if seen is None else seen.frame_id) or CAMERA_FRAME
+    known, named = dict.fromkeys((published.frame_id, camera)), frame_id.removeprefix("/")
+    if named not in known or not np.isfinite(place).all():
+        raise InputError(
+            f"point_at: {place.tolist()} in {frame_id!r} is no place; allowed are metres in "
+            f"{' or '.join(known)}, and column, row and z = 0 of a pixel in {camera}."
+        )
+    place_mm = place * MM_PER_M
+    if named != camera:
+        return place_mm
+    if place[2] == 0:
+        place_mm = _under_pixel(place[:2].round(), None if seen is None else seen.content)
+    return transform_points(published.published_from_camera, place_mm[None].astype(float))[0]
+
+
+def _under_pixel(pixel: np.ndarray, content: DepthFrame | SensorCloud | None) -> np.ndarray:
+    """Where the depth image has it, camera frame, mm. Raises InputError: it does not."""
+    column, row = pixel.tolist()
+    height, width = content.depth_mm.shape if isinstance(content, DepthFrame) else (0, 0)
+    if isinstance(content, DepthFrame) and 0 <= row < height and 0 <= column < width:
+        index = np.array([int(row) * width + int(column)])
+        depth_mm = content.depth_mm.ravel()[index]
+        if np.isfinite(depth_mm).all():
+            return deproject_pixels(index, depth_mm, content.intrinsics)[0]
+    raise InputError(
+        f"point_at: the pixel {column:g}, {row:g} has no depth now; the image is {width} x "
+        f"{height}. Point at another one on the organ."
+    )

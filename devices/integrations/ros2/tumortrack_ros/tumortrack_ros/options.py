@@ -16,6 +16,8 @@ class Option(NamedTuple):
 
 
 REQUIRED = ("model", "source")
+# What a run is about: only while the node is not active. The others start tracking anew.
+FIXED = {"executable", *REQUIRED, "sinks", "patient", "side", "device", "report"}
 OPTIONS = {
     "executable": Option("tumortrack", "the command, with its folder if it is not on the PATH"),
     "model": Option("", "a case, or the folder of a model"),
@@ -47,7 +49,7 @@ def command(values: Mapping[str, Any]) -> list[str]:
         about = OPTIONS[lacking[0]].description
         raise ValueError(f"the parameter {lacking[0]} is not set: {about}")
     for name, value in known.items():
-        _check(name, value)
+        check(name, value)
     arguments = [known.pop("executable"), "track", *(known.pop(name) for name in REQUIRED)]
     arguments += known.pop("sinks")
     for name, value in known.items():
@@ -58,8 +60,8 @@ def command(values: Mapping[str, Any]) -> list[str]:
     return arguments
 
 
-def _check(name: str, value: Any) -> None:
-    """Raises ValueError: it is not allowed."""
+def check(name: str, value: Any) -> None:
+    """Raises ValueError: a parameter's value is not allowed."""
     limits, texts = OPTIONS[name].limits, str(value).split()
     if not limits or value == "":
         return
