@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Callable
 from textwrap import fill
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
 from tumortrack.core import colours
 from tumortrack.core.colours import Colour
@@ -115,9 +116,7 @@ class ResultMessages:
         out.append(Outgoing("cloud", CLOUD, cloud))
         send_markers("meshes", self._organ(result), lifetime={"sec": _LIFETIME_S})
         for name in self._context.parts:
-            center_mm = result.center_mm(name)
-            metres = np.full(3, np.nan) if center_mm is None else center_mm / MM_PER_M
-            send(f"{name}/center", PLACE, header=header, point=xyz(metres))
+            send(f"{name}/center", PLACE, header=header, point=_place(result.center_mm(name)))
         if self._observed:
             touches = self._extra_status.touches
             out += crtk_messages(result, self._context.parts, touches, self._messages)
@@ -129,8 +128,18 @@ class ResultMessages:
         if self._status_rate.due() or levels != self._levels:
             send("/diagnostics", DIAGNOSTICS, header=header, status=status)
         self._levels = levels
-        if self._context.controller is None:
-            return out
+        if self._context.controller is not None:
+            self._add_arms(result, send, send_markers)
+            if self._observed and (points := self._points(result)) is not None:
+                seen = plain_cloud(SensorCloud(points, result.stamp_ns), header, self._messages)
+                out.append(Outgoing("observed", CLOUD, seen))
+        return out
+
+    def _add_arms(
+        self, result: TrackingResult, send: Callable[..., None], send_markers: Callable[..., None]
+    ) -> None:
+        """Their joints and shapes. The header is the result's."""
+        header = self._messages.header(result.stamp_ns, result.published_frame.frame_id)
         joints = {} if result.control is None else result.control.joints_rad
         angles = np.array(list(joints.values()), np.float64)
         send("joint_states", JOINTS, header=header, name=list(joints), position=angles)
@@ -139,10 +148,6 @@ class ResultMessages:
         for suffix in LATCHED:
             if (markers := self._rigid(suffix, result)) is not None:
                 send_markers(suffix, markers, frame_locked=True)  # at any time, not their stamp's
-        if self._observed and (points := self._points(result)) is not None:
-            seen = plain_cloud(SensorCloud(points, result.stamp_ns), header, self._messages)
-            out.append(Outgoing("observed", CLOUD, seen))
-        return out
 
     def _frames(self, result: TrackingResult) -> list[dict[str, Any]]:
         """A transform to each part, of good estimates only: tf can't mark one as poor; and to each
@@ -265,6 +270,11 @@ class ResultMessages:
         for rank, touch in enumerate(self._extra_status.touches, start=1):
             values[f"{_NEXT}_{rank}"] = touch.message
         return _status(_LEVELS[result.quality], "estimate", result.describe(), result, values)
+
+
+def _place(place_mm: Float64[np.ndarray, " 3"] | None) -> dict[str, float]:
+    """A Point; NaN where it is not known."""
+    return xyz(np.full(3, np.nan) if place_mm is None else place_mm / MM_PER_M)
 
 
 def _arms_status(result: TrackingResult) -> dict[str, Any]:
