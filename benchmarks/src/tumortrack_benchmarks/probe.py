@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from tumortrack.core.geometry import Affine, Points, rigid, transform_points, unit
+from tumortrack.core.geometry import Affine, rigid, transform_points, unit
 from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.core.ultrasound import ImageErrors, ProbeRecording, spread_px
 
@@ -101,7 +101,9 @@ def section_mm(mesh: Mesh, frame_from_image: Affine) -> Float64[np.ndarray, "n 2
     return (a + share * (b - a))[:, :2]
 
 
-def _drawn(places_mm: Points, std_mm: float, rng: np.random.Generator) -> np.ndarray:
+def _drawn(
+    places_mm: Float64[np.ndarray, "n 2"], std_mm: float, rng: np.random.Generator
+) -> Float64[np.ndarray, "n 2"]:
     """As a reader draws them: off by a smooth wave around their middle."""
     places_mm = spread_px(places_mm, (1.0, 1.0))
     away = places_mm - places_mm.mean(0) if len(places_mm) else places_mm
