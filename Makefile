@@ -79,7 +79,7 @@ check: setup  ## lint, types, import order, licences, figures in the pages
 debian:  ## install what tests need from Debian (Chromium, libusb, a compiler)
 	tools/debian.sh
 
-clients: $(TRACKER)  ## install other makers' programs that tests talk to (ROS 2's rclpy and Fast DDS, ur_rtde, 3D Slicer's core: 1 GB); they have wheels of Python 3.11 on x86-64
+clients: $(TRACKER)  ## install other makers' programs that tests talk to (ROS 2's rclpy and Fast DDS, ur_rtde, 3D Slicer's core, usd-core, newton: 1.6 GB); they have wheels of Python 3.11 on x86-64
 	@if $(BIN)/python -c 'import platform, sys; sys.exit(sys.version_info[:2] != (3, 11) or platform.machine() != "x86_64")'; \
 	then $(MAKE) --no-print-directory $(CLIENTS); else echo "make clients: not Python 3.11 on x86-64; tests that need them skip"; fi
 

@@ -20,6 +20,7 @@ from tumortrack.core.geometry import transform_points
 from tumortrack.core.rigid_fit import kabsch
 from tumortrack.core.solids import solid_of
 from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.organ.tets import TetMesh
 from tumortrack_benchmarks.physics import segmentation
 from tumortrack_benchmarks.physics.equilibrium import Rod, find_equilibrium
 from tumortrack_benchmarks.physics.families import FAMILIES, Deformed, solve
@@ -28,7 +29,7 @@ from tumortrack_benchmarks.physics.kidneys import random_anatomy
 from tumortrack_benchmarks.physics.noise import StereoCamera, StereoConfig
 from tumortrack_benchmarks.physics.organ import Slit, Stage, cut_open
 from tumortrack_benchmarks.physics.solid import NeoHookeanSolid
-from tumortrack_benchmarks.physics.tets import TetMesh, tetrahedralise
+from tumortrack_benchmarks.physics.tets import tetrahedralise
 
 CAMERA = d405(424, 240)
 SILENT = {"bias_px": 0.0, "lens_px": 0.0, "slant_px": 0.0, "gloss_degrees": 0.0, "quantum_mm": 0.0}

@@ -13,13 +13,14 @@ from scipy.spatial.transform import Rotation
 
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.organ.tets import TetMesh, lattice, tet_volumes
 from tumortrack_benchmarks.physics import twin
 from tumortrack_benchmarks.physics.equilibrium import ContactPlate, Rod, Support, find_equilibrium
 from tumortrack_benchmarks.physics.families import even_tissue
 from tumortrack_benchmarks.physics.forces import LoadedBody, Steady, Touch, Weight, rows_of
 from tumortrack_benchmarks.physics.organ import Stage
 from tumortrack_benchmarks.physics.solid import NeoHookeanSolid
-from tumortrack_benchmarks.physics.tets import TetMesh, find, lattice, tet_volumes, tetrahedralise
+from tumortrack_benchmarks.physics.tets import find, tetrahedralise
 from tumortrack_benchmarks.physics.twin import Bench, solve
 
 pytestmark = pytest.mark.slow

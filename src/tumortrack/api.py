@@ -219,18 +219,19 @@ def write_scenes(
 
 
 def export(case: StrPath, folder: StrPath, **options: Unpack[ExportKeywords]) -> tuple[str, ...]:
-    """Write a case, or what was located, as a scene for 3D Slicer, and a CT's as DICOM; returns
-    what to know of the DICOM file. Raises InputError, ArtifactError: folders or options that do
-    not fit each other, or cannot be used.
+    """Write a case, or what was located, as a scene for 3D Slicer, and a CT's as DICOM, or as a
+    body for a simulator; returns what to know of what was written. Raises InputError,
+    ArtifactError: folders or options that do not fit each other, or cannot be used.
 
     Args:
         case: folder that ``prepare`` wrote, or alone one that ``locate`` wrote.
         options: as `tumortrack export --help` explains them.
     """
-    from tumortrack.report import slicer_scene
+    from tumortrack.report import bodies, slicer_scene
 
     asked = options_from(ExportOptions, {**options}, "export")
-    return slicer_scene.export(Path(case), Path(folder), asked)
+    write = slicer_scene.export if asked.format == "slicer" else bodies.export_body
+    return write(Path(case), Path(folder), asked)
 
 
 def train(

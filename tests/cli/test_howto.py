@@ -30,6 +30,7 @@ LEFT = {  # what a page's commands leave behind, besides what they print
     "plan": ("PLAN/plan.png",),
     "poor-answer": ("RUN/index.html",),
     "ros2": ("report.json",),
+    "simulators": ("BODY/body.usda", "BODY/body.json"),
     "slicer": ("FOR_SLICER/case.seg.nrrd", "RUN/labels.seg.nrrd"),
 }
 

@@ -1,4 +1,4 @@
-"""Other makers' programs that ours talk to: rclpy, ur_rtde, 3D Slicer's core (`make clients`)."""
+"""Other makers' programs: rclpy, ur_rtde, 3D Slicer's core, newton, ... (`make clients`)."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ IDENTITY = Path(__file__).parent
 FOLDER = IDENTITY.parents[1] / ".clients"
 
 
-def environment(package: str) -> dict[str, str]:
+def environment(package: str, module: str = "") -> dict[str, str]:
     """Of a process that uses this package: what a ROS's setup.bash sets, and the tests' modules.
-    Without it the test is skipped, with the package's name."""
+    Without it (or its ``module``: what was installed is older) the test is skipped, with the
+    package's name."""
     site = FOLDER / "lib" / f"python{sys.version_info[0]}.{sys.version_info[1]}" / "site-packages"
-    if not (FOLDER / ".installed").exists() or not site.is_dir():
+    if not (FOLDER / ".installed").exists() or not (site / module).is_dir():
         needs.missing(f"{package}: make clients (Python 3.11 on x86-64)")
     libraries = [FOLDER / "lib", *sorted(site.glob("ros_*.libs"))]
     paths = [IDENTITY, site, *filter(None, [os.environ.get("PYTHONPATH")])]
@@ -29,6 +30,7 @@ def environment(package: str) -> dict[str, str]:
         "LD_LIBRARY_PATH": os.pathsep.join(map(str, libraries)),
         "PYTHONPATH": os.pathsep.join(map(str, paths)),
         "ROS_LOG_DIR": str(FOLDER / "log"),
+        "WARP_CACHE_PATH": str(FOLDER / "warp"),  # kernels, compiled once
     }
 
 

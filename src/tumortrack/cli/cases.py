@@ -86,12 +86,14 @@ class Prepare(PrepareOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Export(ExportOptions):
-    """Write a case, or what was located, as a scene for 3D Slicer, and a CT's as DICOM.
+    """Write a case, or what was located, as a scene for 3D Slicer, and a CT's as DICOM, or as a
+    body for a simulator.
 
     Attributes:
         case: folder that `prepare` wrote, or alone one that `locate` wrote.
         out: folder to write: scene.mrb; of a case also case.seg.nrrd, structures as
-            PLY and, with --dicom, segmentation.dcm.
+            PLY and, with --dicom, segmentation.dcm. Of a body: body.tets.vtk, rest.tets.vtk and a
+            .vtk of each surface, or body.usda; and body.json.
     """
 
     case: Positional[Path]

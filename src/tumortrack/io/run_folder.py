@@ -31,6 +31,7 @@ from tumortrack.io.points import PointTable, camera_table
 from tumortrack.io.segmentation_files import segments, write_seg_nrrd
 
 MARGIN = "_margin"  # suffix of the names of shells
+MOTION = "motion.safetensors"  # of the preset elastic
 CENTRES, CT = "tumors", "ct"  # names of the tumor centres and of the organ's pose in 3D Slicer
 
 

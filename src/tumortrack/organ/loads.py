@@ -23,10 +23,12 @@ from tumortrack.native import F64, kernel
 from tumortrack.organ.modes import ReducedModel
 
 KPA = 1e-3  # N/mm2
+TISSUE_KPA = (3.0, 30.0)  # Young's modulus of a random organ's tissue
+DENSITY = 1.05e-6  # kg/mm3
 Vector = Float64[np.ndarray, " 3"]
 _OBSTACLE = 100 * KPA  # N/mm3, of plates and instruments
 _GRIP = 50 * KPA  # N/mm3, of a held region
-_WEIGHT = 1.05e-6 * 9.81  # N/mm3
+_WEIGHT = DENSITY * 9.81  # N/mm3
 _EDGE_MM = 4.0  # width over which an obstacle's edge fades
 _DEEPEST = 0.28  # largest depth of a plate, over the organ's thickness
 _FARTHEST_MM = 16.0  # largest motion of a place on a kidney's surface
@@ -192,7 +194,7 @@ LOADS: tuple[tuple[Callable[[ReducedProblem, np.random.Generator], None], float]
 def in_bed(organ: ReducedModel, up: Vector, rng: np.random.Generator) -> ReducedProblem:
     """An organ of random tissue (3-30 kPa, tumors 0.8-8 times that) in a random bed: springs of
     0.5-20 kPa/mm on the underside, in some states against sinking only, in others both ways."""
-    modulus = KPA * _log_uniform(3, 30, rng)
+    modulus = KPA * _log_uniform(*TISSUE_KPA, rng)
     stiffness = organ.stiffness(modulus, _log_uniform(0.8, 8, rng))
     problem = ReducedProblem(organ, up, modulus, stiffness, np.zeros(len(stiffness)))
     patches = organ.patches

@@ -151,6 +151,58 @@ class ElasticMotion(Renamed):
         out[:, :3, :3], out[:, 3:, :3] = places_mm2, out[:, :3, 3:].transpose(0, 2, 1)
         return out
 
+    def spread_modes(
+        self, points_ct: Points, weights: Float64[np.ndarray, " n"]
+    ) -> Float64[np.ndarray, "n 3 q"]:
+        """The covariance of all places together: the sum of ``mode @ mode.T``. Each mode is what
+        one standard deviation of it does (mm, camera's axes), independently of the others; the
+        first ones move points most, by their ``weights``. At each point alone, what they do
+        together is ``covariance_mm2``. Raises InputError: the motion has no covariance."""
+        if self.covariance is None:
+            raise InputError("a motion that was not fitted has no covariance.")
+        points, places_mm = _given(points_ct), self.forward(points_ct)
+        squares, axes = np.linalg.eigh(self.covariance)
+        effects = self.effects(points) @ (axes * np.sqrt(np.maximum(squares, 0)))
+        columns = [self.std_scale * (self.rotation @ effects)]
+        for alternative, share in self.alternatives:
+            away = alternative.forward(points) - places_mm
+            columns.append(self.std_scale * np.sqrt(share) * away[:, :, None])
+        every = np.concatenate([*columns, self.depth_share * places_mm[:, :, None]], axis=2)
+        _, turn = np.linalg.eigh(np.einsum("nxa,n,nxb->ab", every, weights, every, optimize=True))
+        return every @ turn[:, ::-1]
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """All of a fitted motion but its shape. ``places``: a row of it and of each alternative
+        (that may have fewer coefficients): share, rotation, centre, coefficients."""
+        assert self.covariance is not None
+        every = (self, 1.0), *self.alternatives
+        rows = np.zeros((len(every), 13 + len(self.coefficients)))
+        for row, (motion, share) in zip(rows, every, strict=True):
+            known = share, *motion.rotation.flat, *motion.centre_mm, *motion.coefficients
+            row[: len(known)] = known
+        scales = np.array([self.depth_share, self.std_scale])
+        return {"places": rows, "covariance": self.covariance, "scales": scales}
+
+    @classmethod
+    def from_arrays(cls, shape: RestShape, arrays: dict[str, np.ndarray]) -> ElasticMotion:
+        """The inverse of ``to_arrays``. Raises InputError: an array is missing, or none of such a
+        motion of this shape."""
+        names, size = ("places", "covariance", "scales"), POSE + shape.body.modes.shape[-1]
+        rows, covariance, scales = (np.array(arrays.get(name, ()), float) for name in names)
+        fits = rows.ndim == 2 and len(rows) and rows.shape[1] == 13 - POSE + size
+        if not fits or (covariance.shape, scales.shape) != ((size, size), (2,)):
+            raise InputError(f"a motion does not fit a body of {size - POSE} modes; locate again.")
+        turns = rows[:, 1:10].reshape(-1, 3, 3)
+        unit = np.allclose(turns @ turns.transpose(0, 2, 1), np.eye(3), atol=1e-6)
+        if not unit or (np.linalg.det(turns) < 0).any() or (rows[:, 0] < 0).any():
+            raise InputError("a motion's rotations or shares are none; locate again.")
+        first, *others = (
+            cls(shape, turn, row[10:13], row[13:]) for turn, row in zip(turns, rows, strict=True)
+        )
+        first = replace(first, alternatives=tuple(zip(others, rows[1:, 0].tolist(), strict=True)))
+        depth_share, std_scale = scales.tolist()
+        return replace(first, covariance=covariance, depth_share=depth_share, std_scale=std_scale)
+
     def _spread(
         self, points: Float32[np.ndarray, "n 3"], out: Float64[np.ndarray, "n 3 3"]
     ) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -85,11 +85,20 @@ class Located:
     def save(self, folder: str | Path, overwrite: bool = False) -> None:
         """Write the folder that `tumortrack locate` writes. Raises InputError: it exists and
         ``overwrite`` is False; StorageError: the disk refused."""
+        from safetensors.numpy import save
+
         from tumortrack.io import run_folder as files
+        from tumortrack.registration.motion import ElasticMotion
         from tumortrack.report.page import write_run_page
 
         report, folder = self.report, Path(folder)
-        add = partial(write_run_page, report=report, estimate=self.estimate, shown=self.seen)
+
+        def add(new: Path) -> None:
+            write_run_page(new, report, self.estimate, self.seen)
+            motion = None if self.estimate is None else self.estimate.motion
+            if isinstance(motion, ElasticMotion) and motion.covariance is not None:
+                store.write_atomically(new / files.MOTION, save(motion.to_arrays()))
+
         if self.estimate is None:
             files.write_no_estimate(folder, report, overwrite, add)
         else:

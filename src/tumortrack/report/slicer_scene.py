@@ -77,7 +77,7 @@ def _export_case(
     moved = (options.located, options.live) != (None, None)
     scene.add_case(folder, case, file.read_bytes(), moved)
     if options.located is not None:
-        report = _report_with_motion(options.located, case, folder)
+        report = report_with_motion(options.located, case, folder)
         scene.add_ct_transform(report["motion"]["camera_from_ct"])
         scene.add_run(options.located, report)
     if options.live is not None:
@@ -94,7 +94,7 @@ def _export_case(
     return write_dicom_seg(file, labels, parts, options.dicom, series, shown)
 
 
-def _report_with_motion(run: Path, case: Case, folder: Path) -> dict[str, Any]:
+def report_with_motion(run: Path, case: Case, folder: Path) -> dict[str, Any]:
     """report.json of a run. Raises InputError: of another case's model, or without a motion."""
     report = read_report(run)
     if report.get("model", {}).get("case_sha256") != case.sha256:

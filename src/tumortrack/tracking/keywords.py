@@ -56,6 +56,7 @@ class SimulateKeywords(TypedDict, total=False):
 class ExportKeywords(TypedDict, total=False):
     """See ``ExportOptions``."""
 
+    format: Literal["slicer", "vtk", "usd"]
     located: StrPath | None
     live: str | None
     dicom: StrPath | None

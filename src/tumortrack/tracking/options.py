@@ -206,6 +206,9 @@ class ExportOptions:
     """Options of `export`.
 
     Attributes:
+        format: a scene for 3D Slicer, or a body for a simulator: tetrahedra with parts and presumed
+            stiffness, and surfaces, as legacy VTK (for SOFA) or USD (for newton), in mm.
+            Takes only --located, which adds where the organ is and the modes of its uncertainty.
         located: folder that `locate` wrote with this case's model: the scene shows its surfaces,
             and the CT and its segmentation where the organ is.
         live: HOST:PORT of a sink `openigtlink`: the scene connects to it, shows what it sends, and
@@ -215,6 +218,7 @@ class ExportOptions:
         patient: the PatientID of --dicom, where the case has a pseudonym.
     """
 
+    format: Literal["slicer", "vtk", "usd"] = "slicer"
     located: Path | None = None
     live: str | None = None
     dicom: Path | None = None

@@ -26,6 +26,7 @@ from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.rigid_fit import matched_vertices
 from tumortrack.io.case import Case, load_case, save_case
 from tumortrack.io.scene_folder import read_scene
+from tumortrack.organ.tets import lattice
 from tumortrack.registration.base_model import Model
 from tumortrack.report.pictures import qc_picture, scene_picture
 from tumortrack.report.protocol import evaluate_scene
@@ -42,7 +43,6 @@ from tumortrack_benchmarks.physics.scenes import (
     bench_from_ct,
     simplified,
 )
-from tumortrack_benchmarks.physics.tets import lattice
 
 # Those of the wider world but for cut organs, which are not located any more.
 FAMILIES = ("rest", "plate", "clamp", "twist", "pull", "tether", "roll")

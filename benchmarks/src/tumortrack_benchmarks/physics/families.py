@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.geometry import perpendicular, unit
+from tumortrack.organ.tets import TetMesh
 from tumortrack_benchmarks.physics.equilibrium import (
     ContactPlate,
     Nodes,
@@ -46,7 +47,7 @@ from tumortrack_benchmarks.physics.organ import (
     cut_open,
 )
 from tumortrack_benchmarks.physics.solid import NeoHookeanSolid
-from tumortrack_benchmarks.physics.tets import TetMesh, find
+from tumortrack_benchmarks.physics.tets import find
 
 _LARGEST_CHANGE, _NEARLY_NONE = 0.05, 0.02  # of volume; from Poisson's ratio 0.49 on the second
 BED_DEPTH_MM = 15.0  # of fat under the organ: what turns the bed's modulus into stiffness

@@ -16,9 +16,9 @@ from scipy.sparse import bsr_matrix, csr_matrix, eye, kron
 from tumortrack.core.mesh_query import contains, surface_distance
 from tumortrack.core.types import Mesh
 from tumortrack.native import F64, kernel
+from tumortrack.organ.tets import FACES, TetMesh
 from tumortrack_benchmarks.physics.equilibrium import Nodes, Points
 from tumortrack_benchmarks.physics.solid import NeoHookeanSolid
-from tumortrack_benchmarks.physics.tets import FACES, TetMesh
 
 _STEADY_MN_MM = 2e4
 _STICK_MM = 0.2  # a smaller slip meets less than full friction: keeps the energy smooth

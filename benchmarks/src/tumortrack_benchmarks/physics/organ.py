@@ -19,10 +19,11 @@ from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.mesh_query import surface_samples
 from tumortrack.core.raster import label_grid
 from tumortrack.core.types import Anatomy, Mesh
+from tumortrack.organ.tets import FACES, TetMesh
 from tumortrack_benchmarks.physics.equilibrium import Points
 from tumortrack_benchmarks.physics.forces import Bed, Obstacle, Springs, Touch, rows_of
 from tumortrack_benchmarks.physics.solid import NeoHookeanSolid
-from tumortrack_benchmarks.physics.tets import FACES, TetMesh, find
+from tumortrack_benchmarks.physics.tets import find
 
 _HARD_KPA_MM = 150.0  # of plates, rods
 

@@ -20,11 +20,12 @@ from tumortrack.core.types import Anatomy
 from tumortrack.io.case import Case, load_case
 from tumortrack.io.mesh_files import write_anatomy
 from tumortrack.io.scene_folder import InnerPoints, Scene, Targets, draw_targets, list_scenes
+from tumortrack.organ.tets import TetMesh
 from tumortrack_benchmarks.physics import segmentation
 from tumortrack_benchmarks.physics.families import FAMILIES, Deformed, solve
 from tumortrack_benchmarks.physics.kidneys import SHAPES, random_anatomy
 from tumortrack_benchmarks.physics.organ import Organ, transformed
-from tumortrack_benchmarks.physics.tets import TETS, TetMesh, kept, tetrahedralise
+from tumortrack_benchmarks.physics.tets import TETS, kept, tetrahedralise
 from tumortrack_benchmarks.physics.views import organ_cloud, render_view
 from tumortrack_experiment.kit.base import laid_down as bench_from_ct
 

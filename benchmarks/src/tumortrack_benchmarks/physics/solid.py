@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 from scipy.sparse import csr_matrix, diags
 
-from tumortrack_benchmarks.physics.tets import TetMesh
+from tumortrack.organ.tets import TetMesh
 
 PER_TET = 0.05  # share of the bulk modulus that is kept per tetrahedron
 
