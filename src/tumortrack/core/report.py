@@ -41,8 +41,8 @@ Kind = Literal[
 
 
 FAR_OFF = "miss", "depths"  # what makes an answer poor that nothing else speaks against
-# Known well enough: 0.5 mm of a probe's way at 10 mm/s, and 1 mm of 5 cm.
-_KNOWN_LAG_S, _KNOWN_SCALE = 0.05, 0.02
+# Known well enough: with 95 % to 0.5 mm of a probe's way at 10 mm/s; to 1 mm of 5 cm.
+_KNOWN_LAG_S, _KNOWN_SCALE = 0.025, 0.02
 
 
 class _Said(msgspec.Struct, forbid_unknown_fields=True):
