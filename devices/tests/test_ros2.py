@@ -277,9 +277,7 @@ def test_who_has_seen_what_contradicts_says_so_on_a_topic(bus: Bus, messages: Me
 def test_a_user_halts_forgets_and_points_at_the_organ(bus: Bus, messages: Messages) -> None:
     """Arms are halted where some are controlled; elsewhere nobody listens for it."""
     setting, unarmed, update = with_arms(), small_setting(), working()
-    assert update.observation is not None
-    controls, content = setting.controls, update.observation.content
-    assert isinstance(content, DepthFrame)
+    controls = setting.controls
     say = {name: bus.publisher(f"/tumortrack/{name}", kind) for name, kind in ASKED.items()}
     sink, other = SinkRos2().open(setting), SinkRos2().open(unarmed)
 
@@ -312,13 +310,6 @@ def test_a_user_halts_forgets_and_points_at_the_organ(bus: Bus, messages: Messag
         assert not unarmed.controls.aborted.is_set()
         np.testing.assert_allclose(point_at("table", 0.01, -0.02, 0.0), [10, -20, 0])
         np.testing.assert_allclose(point_at("camera", 0.01, -0.02, 0.13), [10, 20, 30], atol=1e-9)
-        row, column = np.argwhere(np.isfinite(content.depth_mm))[7]
-        (there_mm,) = transform_points(
-            np.linalg.inv(TABLE.published_from_camera), point_at("camera", column, row, 0.0)[None]
-        )
-        pixel, depth_mm = project(there_mm[None], content.intrinsics)
-        np.testing.assert_allclose([*pixel[0], depth_mm[0]], [column, row,
-                                   content.depth_mm[row, column]], atol=1e-4)  # fmt: skip
     finally:
         sink.close()
         other.close()
@@ -329,8 +320,7 @@ def test_a_user_halts_forgets_and_points_at_the_organ(bus: Bus, messages: Messag
     [
         ((0.0, 0.0, 0.1), "elsewhere", "elsewhere"),
         ((np.nan, 0.0, 0.1), "table", "nan"),
-        ((1e9, 0.0, 0.0), "camera", "64 x 48"),
-        ((-1.0, 3.0, 0.0), "camera", "-1"),
+        ((320.0, 240.0, 0.0), "camera", "320"),  # a pixel
     ],
 )
 def test_what_is_no_place_of_the_organ_is_refused(

@@ -9,7 +9,7 @@ from tyro.conf import Positional, UseAppendAction
 
 from tumortrack.cli.console import console, say, say_json, say_notes, warn
 from tumortrack.core.errors import InputError
-from tumortrack.core.store import check_place, write_json
+from tumortrack.core.store import check_place
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,16 +21,14 @@ class Frames:
 
     Attributes:
         file: calibration files, folders of `locate`, `plan` or `calibrate hand-eye`, poses of
-            cameras (JSON), evidence, PLUS configurations (.xml), live tf (ros2:FRAME); tables of
+            cameras (JSON), PLUS configurations (.xml), live tf (ros2:FRAME); tables of
             poses (.csv), NAME=TABLE saying of what, or of three or more places touched in two
             frames (columns A_x, A_y, A_z, B_x, B_y, B_z, mm). Two tables of the poses of
             one NAME, a board say, in two frames compare these. Earlier files make the chains.
         to: frame in which the others are given.
         same: A=B: two names of one frame.
         distance: of the organ from the camera, mm, where links are compared.
-        at: time of the tables' poses, ns (default: the last that all have).
         out: picture to write (.png); nothing is replaced.
-        correct: calibration file to write, for --frame: as the first touches or board have it.
         json: print all as JSON.
     """
 
@@ -38,9 +36,7 @@ class Frames:
     to: str = "camera"
     same: UseAppendAction[tuple[str, ...]] = ()
     distance: float = 150.0
-    at: int = 0
     out: Path | None = None
-    correct: Path | None = None
     json: bool = False
 
     def run(self) -> int:
@@ -57,20 +53,16 @@ class Frames:
             known.links.append(Link(b, a, IDENTITY, f"--same {a}{same}{b}", 0.0))
         for text in self.file:
             known.add(text)
-        known.at(self.at)
-        links = [*known.links, *(fit.link for fit in known.fits)]
-        there = {CAMERA, *known.frames, *(end for link in links for end in (link.a, link.b))}
+        known.link_tables()
+        links = [*known.links, *known.fits]
+        there = {CAMERA, *(end for link in links for end in link[:2])}
         if self.to not in there:
             raise InputError(f"--to {self.to} is not among the frames: {', '.join(sorted(there))}.")
-        graph = FrameGraph(links, self.to, known.frames, self.distance)
-        wrong = [*report.missing_lines(graph), *report.fault_lines(links)]
-        wrong += map(report.open_line, cycles := list(graph.open_cycles()))
-        if self.correct is not None:
-            write_json(self.correct, report.corrected(graph, known.fits))
-        for line in (
-            *report.chain_lines(graph),
-            *(report.fit_line(graph, one) for one in known.fits),
-        ):
+        graph = FrameGraph(links, self.to, self.distance)
+        cycles = list(graph.open_cycles())
+        wrong = [f"{link.name} {fault}." for link in links for fault in link.faults]
+        wrong += [*report.missing_lines(graph), *map(report.open_line, cycles)]
+        for line in report.chain_lines(graph):
             say(line)
         say_notes(known.notes)
         warn(wrong)
@@ -92,7 +84,7 @@ class Frames:
             raise InputError(
                 "say which: tumortrack frames FILE [FILE ...] [--same A=B] [--to FRAME]"
             )
-        if self.out is not None and self.out.suffix.lower() != ".png":
-            raise InputError(f"--out {self.out}: pictures are .png.")
-        for path in filter(None, (self.out, self.correct)):
-            check_place(path, "file", None)
+        if self.out is not None:
+            if self.out.suffix.lower() != ".png":
+                raise InputError(f"--out {self.out}: pictures are .png.")
+            check_place(self.out, "file", None)

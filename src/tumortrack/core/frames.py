@@ -115,6 +115,7 @@ def fit_link(b: str, a: str, places_b: Points, places_a: Points, source: str) ->
     b_from_a = kabsch(places_a, places_b, np.ones(count))
     left_mm = np.linalg.norm(transform_points(b_from_a, places_a) - places_b, axis=1)
     std_mm = float(np.linalg.norm(left_mm)) / (count - 2) ** 0.5  # of a place
+    source = f"{source}, to {std_mm:.1f} mm"
     faults = (f"leaves places {std_mm:.1f} mm off: touch again",) * (std_mm > _SCATTER_MM)
     std_mm = max(std_mm, _TOUCH_MM)
     error_deg = float(np.degrees(_SURE * std_mm / 3**0.5 / spreads[0]))
@@ -135,11 +136,9 @@ class FrameGraph:
     first of its group, by the earlier links; each of the others, ``spare``, closes a cycle. The
     organ is ``distance_mm`` before the camera, or before the first frame of a group without it."""
 
-    def __init__(
-        self, links: Iterable[Link], root: str, frames: Iterable[str] = (), distance_mm: float = 150
-    ) -> None:
+    def __init__(self, links: Iterable[Link], root: str, distance_mm: float = 150) -> None:
         self.spare, kept = list[Link](), list[Link]()
-        together = {name: {name} for name in (root, *frames)}
+        together = {root: {root}}
         for link in links:
             ends = [together.setdefault(end, {end}) for end in (link.a, link.b)]
             (self.spare if ends[0] is ends[1] else kept).append(link)

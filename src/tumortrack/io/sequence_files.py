@@ -33,7 +33,6 @@ _CODES = {
     "LONG": "i4", "ULONG": "u4", "FLOAT": "f4", "DOUBLE": "f8",
 }  # fmt: skip
 _OF_FRAME = re.compile(r"Seq_Frame(\d{1,9})_(\w+)")  # four digits; from frame 10,000 on five
-_OF_SEGMENT = re.compile(r"Segment(\d+)_(Name|LabelValue)")
 _LAST = re.compile(rb"(?m)^ElementDataFile[ \t]*=[ \t]*(.*?)[ \t]*(\r?\n|\Z)")
 _COLOURS = ("vector", "rgb-color", "rgba-color", "3-color", "4-color")
 _FLIPS = {"MF": (1, 1), "UF": (1, -1), "MN": (-1, 1), "UN": (-1, -1)}  # of rows, of columns
@@ -83,16 +82,6 @@ class ImageSequence:
                 frames[int(match[1])][match[2]] = value
         return frames
 
-    @property
-    def segments(self) -> dict[int, str]:
-        """Names by label, where 3D Slicer wrote some. Raises InputError: a damaged label."""
-        found = dict[str, dict[str, str]]()
-        for name, value in self.fields.items():
-            if match := _OF_SEGMENT.fullmatch(name):
-                found.setdefault(match[1], {})[match[2]] = value
-        with readable(self.path, "has a segment whose LabelValue is no number"):
-            return {int(each["LabelValue"]): each.get("Name", "") for each in found.values()}
-
     def images(self) -> Iterator[Image]:
         """One by one, as they lie in the file. Raises InputError: truncated, damaged."""
         size, count = math.prod(self.shape) * self.dtype.itemsize, len(self.frames)
@@ -125,7 +114,7 @@ def read_sequence(path: Path) -> ImageSequence:
     if not path.is_file():
         raise InputError(f"{path} does not exist, or is a folder, a pipe or a device.")
     with readable(path, "has a header that is damaged or lacks a field"):
-        return _nrrd(path) if path.suffix.lower() == ".nrrd" else _meta_image(path)
+        return _checked(_nrrd(path) if path.suffix.lower() == ".nrrd" else _meta_image(path))
 
 
 def _meta_image(path: Path) -> ImageSequence:
@@ -154,7 +143,7 @@ def _meta_image(path: Path) -> ImageSequence:
     dtype = np.dtype((">" if swapped.lower() == "true" else "<") + code)
     sizes, kinds = fields["DimSize"].split(), fields.get("Kinds", "").lower().split()
     axes = _axes(path, sizes, kinds, int(fields.get("ElementNumberOfChannels") or 1))
-    return _checked(ImageSequence(path, axes, dtype, fields, data, start, stored, compressed))
+    return ImageSequence(path, axes, dtype, fields, data, start, stored, compressed)
 
 
 def _nrrd(path: Path) -> ImageSequence:
@@ -166,7 +155,7 @@ def _nrrd(path: Path) -> ImageSequence:
     dtype = np.dtype(order + NRRD_TYPES[fields["type"].lower()])
     axes = _axes(path, fields["sizes"].split(), fields.get("kinds", "").lower().split(), 1)
     stored = path.stat().st_size - start
-    return _checked(ImageSequence(path, axes, dtype, keys, path, start, stored, encoding != "raw"))
+    return ImageSequence(path, axes, dtype, keys, path, start, stored, encoding != "raw")
 
 
 def _axes(
@@ -182,15 +171,12 @@ def _axes(
     spatial = [size for kind, size in axes if kind == "domain"]
     order = [kind for kind, _ in axes if kind != "domain"]
     ends = axes[0][0], axes[-1][0]
-    right = ends == ("colour", "frame") if len(order) > 1 else "frame" in ends
-    least = min(size for _, size in axes)
-    if (
-        not right
-        or len(order) > 2
-        or len(spatial) < 2
-        or any(n > 1 for n in spatial[2:])
-        or least < 0
-    ):
+    if len(order) > 1:
+        right = order == ["colour", "frame"] and ends == ("colour", "frame")
+    else:
+        right = "frame" in ends
+    flat = len(spatial) > 1 and all(size == 1 for size in spatial[2:])
+    if not right or not flat or min(size for _, size in axes) < 0:
         raise InputError(
             f"{path}: its axes are {' x '.join(sizes)} {' '.join(kinds)}; allowed: width x "
             "height x frames, of flat images."

@@ -9,11 +9,10 @@ from __future__ import annotations
 import glob
 import io
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
-from xml.etree import ElementTree
 
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
@@ -24,6 +23,7 @@ from tumortrack.core.geometry import Affine, spacing_mm
 from tumortrack.core.store import natural, read_file, read_json
 from tumortrack.core.ultrasound import ProbeRecording, part_borders_px
 from tumortrack.io.csv_tables import read_pose_table
+from tumortrack.io.plus_files import read_plus
 from tumortrack.io.segments import is_organ, is_tumor, painted
 from tumortrack.io.sequence_files import (
     LARGEST_HEADER,
@@ -36,7 +36,7 @@ from tumortrack.io.volume import nrrd_header, read_raw
 
 _SHARED_STD_MM = 1.0  # of a shift of all places, where no calibration states its error (assumed)
 _PICTURES, _SEQUENCES = (".png", ".bmp", ".tif", ".tiff"), (".mha", ".mhd", ".nrrd")
-_LARGEST_FILE, _MOST_PIXELS = 16 * 2**20, 2**24  # bytes of a mask or a configuration; its pixels
+_LARGEST_FILE, _MOST_PIXELS = 16 * 2**20, 2**24  # bytes of a mask; its pixels
 _EDGE_PX = 2  # a mask that ends so near the edge of what the probe sees was cut there
 _MOST_LABELS = 32  # distinct values: ultrasound has more
 _NO_PART = 255  # in a table of labels: a value that no part has
@@ -45,7 +45,6 @@ _PIXEL_MM, _LARGEST_MM = (0.005, 5.0), 500.0  # a pixel's side, an image's: no p
 _TRANSFORM = re.compile(r"(?!Seq_Frame)(\w+?)To([A-Z]\w*?)Transform")
 _IMAGE, _PROBE, _GOALS = "Image", "Probe", ("Reference", "Tracker")
 _STATED = "UltrasoundImageOrientation"
-_CROPPED = "Segmentation_ReferenceImageExtentOffset"  # Slicer writes the box of what is segmented
 _Edges = dict[tuple[str, str], np.ndarray]  # from a, to b: 4 x 4, or one for each frame
 
 
@@ -126,30 +125,30 @@ def read_recording(path: Path, parts: Sequence[str], asked: RecordingOptions) ->
     if usable.sum() < 2:
         raise InputError(f"{path} has {usable.sum()} valid poses in {goal}; two are needed.")
     masks = asked.masks or path
-    drawn = _masks(masks, parts, sequence, notes)
+    drawn = _masks(masks, parts, notes)
     stamps_s = _stamps_of(drawn, known.stamps_s, of_table, masks)
     field, size = None, None
     if asked.masks is not None and sequence is not None and sequence.has_images:
         field, size = _field(sequence), sequence.shape[:2]
-    names = (asked.mask_part,) if asked.mask_part else tuple(parts)
-    table = np.full(256, 1 if asked.mask_part else _NO_PART, np.uint8)
-    label_of = drawn.label_of or dict(enumerate(range(len(parts) + 1)))
-    for value, label in {0: 0, **(label_of if not asked.mask_part else {})}.items():
-        table[value] = label
+    if asked.mask_part:
+        names, label_of = (asked.mask_part,), dict.fromkeys(range(1, 256), 1)
+    else:
+        names, label_of = tuple(parts), drawn.label_of or {n: n for n in range(1, len(parts) + 1)}
+    table = np.full(256, _NO_PART, np.uint8)
+    table[[0, *label_of]] = [0, *label_of.values()]
     orientation = drawn.orientation or ("MF" if sequence is None else sequence.orientation)
-    pixel_mm, found = spacing_mm(probe_from_image)[:2], list[tuple[int, int, np.ndarray]]()
+    pixel_mm = spacing_mm(probe_from_image)[:2]
+    places_px, part, plane = [np.zeros((0, 2))], list[int](), list[int]()
     for number, (image, stamp_s) in enumerate(zip(drawn.images, stamps_s, strict=True)):
         where = f"{masks}, image {number}"
         size = size or image.shape[:2]
         _check_size(image, pixel_mm, size, where)
         if np.isfinite(stamp_s):
             turned = as_mf(image, orientation, path)
-            borders = _borders(turned, table, names, pixel_mm, field, where)
-            found += [(number, names.index(name), places) for name, places in borders.items()]
-    counts = [len(places) for _, _, places in found]
-    plane, part = (
-        np.repeat(np.array([each[n] for each in found], np.int64), counts) for n in (0, 1)
-    )
+            for name, places in _borders(turned, table, names, pixel_mm, field, where).items():
+                places_px.append(places)
+                part += [names.index(name)] * len(places)
+                plane += [number] * len(places)
     made = ProbeRecording(
         tool=steps[0][1] if len(steps) > 1 else _PROBE,
         frame=goal,
@@ -157,17 +156,17 @@ def read_recording(path: Path, parts: Sequence[str], asked: RecordingOptions) ->
         frame_from_probe=frame_from_probe[usable],
         probe_from_image=probe_from_image,
         parts=names,
-        places_px=np.concatenate([np.zeros((0, 2)), *(places for _, _, places in found)]),
-        part=part,
-        plane=plane,
-        image_stamps_s=stamps_s[plane],
+        places_px=np.concatenate(places_px),
+        part=np.array(part, np.int64),
+        plane=np.array(plane, np.int64),
+        image_stamps_s=stamps_s[np.array(plane, np.int64)],
         shared_std_mm=_SHARED_STD_MM,
     )
-    lost = np.setdiff1d(plane, plane[np.isfinite(made.places_mm()).all(1)])
-    if len(lost) == len(np.unique(plane)):
-        lack = "has a pose near its stamp" if found else f"shows a border of {', '.join(names)}"
+    lost = {*plane} - {*made.plane[np.isfinite(made.places_mm()).all(1)].tolist()}
+    if len(lost) == len({*plane}):
+        lack = "has a pose near its stamp" if plane else f"shows a border of {', '.join(names)}"
         raise InputError(f"{masks}: none of {drawn.total} images {lack}.")
-    if len(lost):
+    if lost:
         notes.append(f"{masks.name}: {len(lost)} images have no pose within 0.5 s: left out.")
     return replace(made, notes=tuple(notes))
 
@@ -186,14 +185,12 @@ def _of_sequence(sequence: ImageSequence) -> _Poses:
             f"{path} has no Seq_Frame0000_Timestamp, so its poses have no time. Give the recording "
             "itself, and this as its --masks; or --poses TABLE.csv."
         )
-    if keys[0] != "Timestamp":
-        notes.append(f"{path.name}: its stamps are unfiltered, and jitter.")
     if sequence.has_images and _STATED not in sequence.fields:
         notes.append(f"{path.name} has no {_STATED}: taken as MF.")
     edges: _Edges = {}
     for name, value in sequence.fields.items():
         if match := _TRANSFORM.fullmatch(name):
-            edges[match[1], match[2]] = _matrix(value, f"{path}: {name}")
+            edges[match[1], match[2]] = _matrix(value.split(), f"{path}: {name}")
     with readable(path, "has a damaged field of a frame"):
         stamps_s = np.array([float(frame.get(keys[0], "nan")) for frame in frames])
         for name in {name for frame in frames for name in frame}:
@@ -228,11 +225,10 @@ def read_image_to_probe(path: Path) -> Affine:
     return found[0]
 
 
-def _matrix(given: str | Iterable[Iterable[float]], where: str) -> Affine:
+def _matrix(given: object, where: str) -> Affine:
     """Raises InputError: it is no affine transform that can be inverted."""
     with readable(where, "is no matrix of 16 numbers"):
-        numbers = given.split() if isinstance(given, str) else [n for row in given for n in row]
-        matrix = np.array([*map(float, numbers)]).reshape(4, 4)
+        matrix = np.array(given, float).reshape(4, 4)
     sizes = np.linalg.norm(matrix[:3, :3], axis=0)
     affine = np.isfinite(matrix).all() and np.array_equal(matrix[3], [0, 0, 0, 1])
     if not affine or abs(np.linalg.det(matrix)) <= _SINGULAR * sizes.prod():
@@ -247,15 +243,7 @@ def _calibration(path: Path) -> _Edges:
         matrix = _matrix(given.probe_from_image, str(path))
         matrix[:3] *= 1000.0 if given.unit == "m" else 1.0
         return {(_IMAGE, given.probe): matrix}
-    content = read_file(path, _LARGEST_FILE)
-    if b"<!DOCTYPE" in content:  # which may define entities without end
-        raise InputError(f"{path} has a DOCTYPE, as no PLUS configuration has.")
-    with readable(path, "is no PLUS configuration with CoordinateDefinitions"):
-        every = ElementTree.fromstring(content).findall(".//CoordinateDefinitions/Transform")
-        return {
-            (each.attrib["From"], each.attrib["To"]): _matrix(each.attrib["Matrix"], str(path))
-            for each in every
-        }
+    return {(each.of, each.to): _matrix(each.rows, str(path)) for each in read_plus(path)}
 
 
 def _steps(
@@ -330,19 +318,15 @@ def _rigid(poses: Float64[np.ndarray, "m 4 4"]) -> Bool[np.ndarray, " m"]:
         return (off < _NOT_RIGID) & (np.linalg.det(turns) > 0) & near
 
 
-def _masks(
-    path: Path, parts: Sequence[str], sequence: ImageSequence | None, notes: list[str]
-) -> _Masks:
+def _masks(path: Path, parts: Sequence[str], notes: list[str]) -> _Masks:
     suffix = path.suffix.lower()
     if suffix == ".nrrd" and path.is_file():
-        fields, keys, _ = nrrd_header(path, LARGEST_HEADER)
-        if "segment0_id" in fields and not fields.get("kinds", "").endswith(("list", "time")):
-            return _segmentation(path, keys.get(_CROPPED, "0 0 0"), parts, sequence, notes)
+        if "segment0_id" in nrrd_header(path, LARGEST_HEADER)[0]:
+            return _segmentation(path, parts, notes)
     if suffix in _SEQUENCES:
         drawn = read_sequence(path)
-        named = drawn.segments and _labels_of(drawn.segments, parts, path, notes)
         stated = drawn.orientation if _STATED in drawn.fields else ""
-        return _Masks(drawn.images(), len(drawn.frames), (), named or None, stated)
+        return _Masks(drawn.images(), len(drawn.frames), orientation=stated)
     inside = path.iterdir() if path.is_dir() else map(Path, glob.glob(str(path)))
     files = sorted((p for p in inside if p.suffix.lower() in _PICTURES), key=natural)
     if not files:
@@ -365,32 +349,14 @@ def _picture(path: Path) -> Image:
         return np.asarray(image.convert(opaque) if opaque else image)
 
 
-def _segmentation(
-    path: Path, offset: str, parts: Sequence[str], sequence: ImageSequence | None, notes: list[str]
-) -> _Masks:
-    """Of 3D Slicer, whose slices are the frames."""
+def _segmentation(path: Path, parts: Sequence[str], notes: list[str]) -> _Masks:
+    """Of 3D Slicer, whose slices are the frames; not of a part of the images."""
     raw = read_raw(path)
     label_of = _labels_of({s.number: s.name for s in raw.segments}, parts, path, notes)
     organ = tuple(number for number, label in label_of.items() if label == 1)
     tumors = tuple(number for number, label in label_of.items() if label > 1)
-    labels = painted(raw.array.shape, raw.segments, organ, tumors)[0]
-    with readable(path, f"has a damaged {_CROPPED}"):
-        left, top, first = map(int, offset.split())
-    whole = labels.shape if sequence is None else (*sequence.shape[1::-1], len(sequence.frames))
-    ends = left + labels.shape[0], top + labels.shape[1], first + labels.shape[2]
-    if min(left, top, first) < 0 or any(end > size for end, size in zip(ends, whole, strict=True)):
-        raise InputError(
-            f"{path} reaches to {ends}, the images to {whole}: give it as their --masks."
-        )
-
-    def images() -> Iterator[Image]:
-        for number in range(whole[2]):
-            image = np.zeros((whole[1], whole[0]), np.uint8)
-            if first <= number < ends[2]:
-                image[top : ends[1], left : ends[0]] = labels[:, :, number - first].T
-            yield image
-
-    return _Masks(images(), whole[2], (), label_of)
+    labels = painted(raw.array.shape, raw.segments, organ, tumors)[0].T
+    return _Masks(labels, len(labels), label_of=label_of)
 
 
 def _labels_of(

@@ -135,21 +135,10 @@ class ElasticMotion(Renamed):
     def pose_covariance(self, points_ct: Points, /) -> Float64[np.ndarray, "n 6 6"] | None:
         """Of the places to which ``forward`` takes points (mm), as ``covariance_mm2``, and of the
         organ's turn, without its deformation (rad), both about the camera's axes."""
-        if self.covariance is None or (places_mm2 := self.covariance_mm2(points_ct)) is None:
+        if self.covariance is None:
             return None
-        out, turn = np.zeros((len(places_mm2), 6, 6)), slice(3, POSE)
-        out[:, :3, 3:] = self.effects(points_ct) @ self.covariance[:, turn]
-        out[:, 3:, 3:] = self.covariance[turn, turn]
-        axes = np.kron(np.eye(2), self.rotation)
-        out = axes @ out @ axes.T
-        for alternative, share in self.alternatives:
-            away_mm = alternative.forward(points_ct) - self.forward(points_ct)
-            away_rad = _rotvec(alternative.rotation @ self.rotation.T)
-            out[:, :3, 3:] += share * away_mm[:, :, None] * away_rad
-            out[:, 3:, 3:] += share * np.outer(away_rad, away_rad)
-        out *= self.std_scale**2
-        out[:, :3, :3], out[:, 3:, :3] = places_mm2, out[:, :3, 3:].transpose(0, 2, 1)
-        return out
+        modes = self._modes(points_ct)
+        return modes @ modes.transpose(0, 2, 1)
 
     def spread_modes(
         self, points_ct: Points, weights: Float64[np.ndarray, " n"]
@@ -160,16 +149,27 @@ class ElasticMotion(Renamed):
         together is ``covariance_mm2``. Raises InputError: the motion has no covariance."""
         if self.covariance is None:
             raise InputError("a motion that was not fitted has no covariance.")
-        points, places_mm = _given(points_ct), self.forward(points_ct)
-        squares, axes = np.linalg.eigh(self.covariance)
-        effects = self.effects(points) @ (axes * np.sqrt(np.maximum(squares, 0)))
-        columns = [self.std_scale * (self.rotation @ effects)]
-        for alternative, share in self.alternatives:
-            away = alternative.forward(points) - places_mm
-            columns.append(self.std_scale * np.sqrt(share) * away[:, :, None])
-        every = np.concatenate([*columns, self.depth_share * places_mm[:, :, None]], axis=2)
+        every = self._modes(points_ct)[:, :3]
         _, turn = np.linalg.eigh(np.einsum("nxa,n,nxb->ab", every, weights, every, optimize=True))
         return every @ turn[:, ::-1]
+
+    def _modes(self, points_ct: Points) -> Float64[np.ndarray, "n 6 q"]:
+        """What one standard deviation of each of its independent unknowns does to places (mm) and
+        the turn (rad), about the camera's axes."""
+        assert self.covariance is not None
+        places_mm = self.forward(points_ct)
+        squares, axes = np.linalg.eigh(self.covariance)
+        unknowns = axes * np.sqrt(np.maximum(squares, 0))
+        moved = self.rotation @ self.effects(points_ct) @ unknowns
+        turned = np.broadcast_to(self.rotation @ unknowns[3:POSE], moved.shape)
+        columns = [self.std_scale * np.concatenate([moved, turned], axis=1)]
+        for alternative, share in self.alternatives:
+            away_mm = alternative.forward(points_ct) - places_mm
+            away_rad = np.tile(_rotvec(alternative.rotation @ self.rotation.T), (len(away_mm), 1))
+            away = np.concatenate([away_mm, away_rad], axis=1)
+            columns.append(self.std_scale * np.sqrt(share) * away[:, :, None])
+        along = np.pad(self.depth_share * places_mm, ((0, 0), (0, 3)))
+        return np.concatenate([*columns, along[:, :, None]], axis=2)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """All of a fitted motion but its shape. ``places``: a row of it and of each alternative

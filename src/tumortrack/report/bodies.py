@@ -15,7 +15,6 @@ import tumortrack
 from tumortrack.core import store
 from tumortrack.core.colours import name_colour, structure_colour
 from tumortrack.core.errors import InputError
-from tumortrack.core.geometry import transform_points
 from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import ORGAN, Anatomy
 from tumortrack.io.body_files import Cells, write_usd, write_vtk
@@ -48,28 +47,27 @@ def export_body(given: Path, out: Path, options: ExportOptions) -> tuple[str, ..
         )
     case, notes = load_case(given), tuple[str, ...]()
     anatomy, organ = case.anatomy, case.anatomy.organ
-    parts = dict(zip(anatomy.names, anatomy.parts, strict=True))
-    surfaces = {**parts, **anatomy.structures}
+    surfaces = {**dict(zip(anatomy.names, anatomy.parts, strict=True)), **anatomy.structures}
     tets = lattice(organ, float(np.cbrt(organ.volume_mm3 / BodyConfig().cells)))
-    shares = tumor_shares(anatomy, tets)
-    body = rest = Cells(tets.nodes_mm, tets.tets, _of_cells(shares))
-    volumes_mm3 = [tets.volumes_mm3.sum(), *(shares @ tets.volumes_mm3)]
+    body = rest = Cells(tets.nodes_mm, tets.tets, _of_cells(tumor_shares(anatomy, tets)))
     about: dict[str, Any] = {
-        **{"tumortrack": tumortrack.__version__, "units": "mm", "frame": "lps"},
-        **{"verdict": "none", "reason": "not located: as in the CT", "case_sha256": case.sha256},
-        "presumed": {"young_modulus_kpa": YOUNG_KPA, "times_in_tumors": CONTRAST}
-        | {"poisson_ratio": POISSON, "density_kg_per_m3": 1e9 * DENSITY},
-        "parts": {
-            name: {"part": n, "surface_ml": parts[name].volume_ml, "tetrahedra_ml": mm3 / 1000}
-            for n, (name, mm3) in enumerate(zip(parts, volumes_mm3, strict=True), ORGAN)
+        "tumortrack": tumortrack.__version__,
+        "units": "mm",
+        "frame": "lps",
+        "verdict": "none",
+        "reason": "not located: as in the CT",
+        "case_sha256": case.sha256,
+        "presumed": {
+            "young_modulus_kpa": YOUNG_KPA,
+            "times_in_tumors": CONTRAST,
+            "poisson_ratio": POISSON,
+            "density_kg_per_m3": 1e9 * DENSITY,
         },
+        "parts": {name: n for n, name in enumerate(anatomy.names, ORGAN)},
     }
     if options.located is not None:
         report, motion = _located(options.located, case, given)
         body, about["modes"] = _moved(rest, tets, motion)
-        nearest_mm = transform_points(np.array(report["motion"]["camera_from_ct"]), tets.nodes_mm)
-        away = {"displacement_mm": body.nodes_mm - nearest_mm}
-        body = replace(body, of_nodes=away | dict(body.of_nodes))
         about |= {"frame": report["frame"], **report["quality"]}
         for name, mesh in surfaces.items():
             surfaces[name] = mesh.with_vertices(motion.forward(mesh.vertices_mm))

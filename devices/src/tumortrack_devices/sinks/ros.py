@@ -7,10 +7,8 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float64
 
-from tumortrack.core.camera import deproject_pixels
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.geometry import Affine, transform_points
-from tumortrack.core.types import DepthFrame, SensorCloud
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 from tumortrack_devices.ros.bus import Bus, Publish, Via, check_topic, open_bus
 from tumortrack_devices.ros.messages import MM_PER_M
@@ -22,6 +20,7 @@ _FLUSH_S = 0.2  # for the last messages to leave
 # What a user asks for, by topic under the namespace; ``halt`` where arms are controlled
 _EMPTY = "std_msgs/msg/Empty"
 ACKNOWLEDGE, HALT, POINT_AT = ("acknowledge", _EMPTY), ("halt", _EMPTY), ("point_at", PLACE)
+_FARTHEST_M = 10.0  # of a place that is pointed at: no camera here sees so far
 ASKED = dict((ACKNOWLEDGE, ("forget", _EMPTY), HALT, POINT_AT))
 
 
@@ -146,33 +145,15 @@ def place_of(
     place: Float64[np.ndarray, " 3"], frame_id: str, result: TrackingResult
 ) -> Float64[np.ndarray, " 3"]:
     """A place on the organ in the published frame, mm. ``place``: in that frame or in the camera's,
-    m; in the camera's with z = 0 column and row of a pixel. Raises InputError."""
+    m. Raises InputError."""
     seen, published = result.observation, result.published_frame
     camera = (None if seen is None else seen.frame_id) or CAMERA_FRAME
     known, named = dict.fromkeys((published.frame_id, camera)), frame_id.removeprefix("/")
-    if named not in known or not np.isfinite(place).all():
+    if named not in known or not (np.abs(place) < _FARTHEST_M).all():
         raise InputError(
-            f"point_at: {place.tolist()} in {frame_id!r} is no place; allowed are metres in "
-            f"{' or '.join(known)}, and column, row and z = 0 of a pixel in {camera}."
+            f"point_at: {place.tolist()} in {frame_id!r} is no place; allowed are metres, below "
+            f"{_FARTHEST_M:g}, in {' or '.join(known)}."
         )
-    place_mm = place * MM_PER_M
     if named != camera:
-        return place_mm
-    if place[2] == 0:
-        place_mm = _under_pixel(place[:2].round(), None if seen is None else seen.content)
-    return transform_points(published.published_from_camera, place_mm[None].astype(float))[0]
-
-
-def _under_pixel(pixel: np.ndarray, content: DepthFrame | SensorCloud | None) -> np.ndarray:
-    """Where the depth image has it, camera frame, mm. Raises InputError: it does not."""
-    column, row = pixel.tolist()
-    height, width = content.depth_mm.shape if isinstance(content, DepthFrame) else (0, 0)
-    if isinstance(content, DepthFrame) and 0 <= row < height and 0 <= column < width:
-        index = np.array([int(row) * width + int(column)])
-        depth_mm = content.depth_mm.ravel()[index]
-        if np.isfinite(depth_mm).all():
-            return deproject_pixels(index, depth_mm, content.intrinsics)[0]
-    raise InputError(
-        f"point_at: the pixel {column:g}, {row:g} has no depth now; the image is {width} x "
-        f"{height}. Point at another one on the organ."
-    )
+        return place * MM_PER_M
+    return transform_points(published.published_from_camera, place[None] * MM_PER_M)[0]
