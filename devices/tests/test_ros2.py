@@ -24,10 +24,8 @@ from live_objects import (
 from refused import refused
 from ros2_objects import DOMAIN, Frames, own_graph
 from ros2_peer import points_mm
-from tumortrack.core.camera import project
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.core.geometry import transform_points
-from tumortrack.core.types import DepthFrame, SensorCloud
+from tumortrack.core.types import SensorCloud
 from tumortrack.live.values import Observation, Source
 from tumortrack_devices.ros import sensors
 from tumortrack_devices.ros.bus import Bus, open_bus
@@ -39,7 +37,7 @@ from tumortrack_devices.sinks.moveit import SCENE
 from tumortrack_devices.sinks.ros import ACKNOWLEDGE, ASKED, place_of
 from tumortrack_devices.sinks.ros import Ros2SinkConfig as SinkRos2
 from tumortrack_devices.sources.ros import Ros2SourceConfig as SourceRos2
-from workcell_objects import TABLE, with_arms, working
+from workcell_objects import with_arms, working
 
 needs.module("cyclonedds", "tumortrack-devices, x86-64, Python up to 3.13")
 

@@ -85,6 +85,6 @@ class Frames:
                 "say which: tumortrack frames FILE [FILE ...] [--same A=B] [--to FRAME]"
             )
         if self.out is not None:
+            check_place(self.out, "file", None)
             if self.out.suffix.lower() != ".png":
                 raise InputError(f"--out {self.out}: pictures are .png.")
-            check_place(self.out, "file", None)

@@ -13,6 +13,7 @@ from tumortrack.core.geometry import Affine, Points, rigid, transform_points
 
 # Places on one border that are nearer err alike: a reader's drawing is smooth over so much.
 APART_MM = 3.0
+PIXEL_MM = 0.005, 5.0  # a pixel's side, at least and at most
 _MOST_PLANES = 150  # of a fit, evenly in time: more cost time and hardly tell more
 _SMOOTH_S = 0.25  # shorter than what a hand does with a probe
 _LONGEST_GAP_S = 0.5  # between poses; between farther ones a hand may have turned back

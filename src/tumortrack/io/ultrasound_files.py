@@ -21,7 +21,7 @@ from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import InputError, readable
 from tumortrack.core.geometry import Affine, spacing_mm
 from tumortrack.core.store import natural, read_file, read_json
-from tumortrack.core.ultrasound import ProbeRecording, part_borders_px
+from tumortrack.core.ultrasound import PIXEL_MM, ProbeRecording, part_borders_px
 from tumortrack.io.csv_tables import read_pose_table
 from tumortrack.io.plus_files import read_plus
 from tumortrack.io.segments import is_organ, is_tumor, painted
@@ -41,7 +41,7 @@ _EDGE_PX = 2  # a mask that ends so near the edge of what the probe sees was cut
 _MOST_LABELS = 32  # distinct values: ultrasound has more
 _NO_PART = 255  # in a table of labels: a value that no part has
 _SINGULAR, _NOT_RIGID, _FARTHEST_MM = 1e-9, 1e-3, 5000.0  # the last two as in ``core.geometry``
-_PIXEL_MM, _LARGEST_MM = (0.005, 5.0), 500.0  # a pixel's side, an image's: no probe sees so far
+_LARGEST_MM = 500.0  # an image's side: no probe sees so far
 _TRANSFORM = re.compile(r"(?!Seq_Frame)(\w+?)To([A-Z]\w*?)Transform")
 _IMAGE, _PROBE, _GOALS = "Image", "Probe", ("Reference", "Tracker")
 _STATED = "UltrasoundImageOrientation"
@@ -130,12 +130,7 @@ def read_recording(path: Path, parts: Sequence[str], asked: RecordingOptions) ->
     field, size = None, None
     if asked.masks is not None and sequence is not None and sequence.has_images:
         field, size = _field(sequence), sequence.shape[:2]
-    if asked.mask_part:
-        names, label_of = (asked.mask_part,), dict.fromkeys(range(1, 256), 1)
-    else:
-        names, label_of = tuple(parts), drawn.label_of or {n: n for n in range(1, len(parts) + 1)}
-    table = np.full(256, _NO_PART, np.uint8)
-    table[[0, *label_of]] = [0, *label_of.values()]
+    names, table = _table_of(drawn, parts, asked.mask_part)
     orientation = drawn.orientation or ("MF" if sequence is None else sequence.orientation)
     pixel_mm = spacing_mm(probe_from_image)[:2]
     places_px, part, plane = [np.zeros((0, 2))], list[int](), list[int]()
@@ -300,7 +295,7 @@ def _chained(
         poses = poses @ np.linalg.inv(probe_from_image)
     if mm_per_pixel:
         probe_from_image = probe_from_image @ np.diag([mm_per_pixel[0], mm_per_pixel[-1], 1, 1])
-    sides_mm, (low, high) = spacing_mm(probe_from_image)[:2], _PIXEL_MM
+    sides_mm, (low, high) = spacing_mm(probe_from_image)[:2], PIXEL_MM
     if len(mm_per_pixel) > 2 or not low <= sides_mm.min() <= sides_mm.max() <= high:
         raise InputError(
             f"{path}: pixels of {' x '.join(f'{side:.4g}' for side in sides_mm)} mm; allowed: "
@@ -320,9 +315,9 @@ def _rigid(poses: Float64[np.ndarray, "m 4 4"]) -> Bool[np.ndarray, " m"]:
 
 def _masks(path: Path, parts: Sequence[str], notes: list[str]) -> _Masks:
     suffix = path.suffix.lower()
-    if suffix == ".nrrd" and path.is_file():
-        if "segment0_id" in nrrd_header(path, LARGEST_HEADER)[0]:
-            return _segmentation(path, parts, notes)
+    is_nrrd = suffix == ".nrrd" and path.is_file()
+    if is_nrrd and "segment0_id" in nrrd_header(path, LARGEST_HEADER)[0]:
+        return _segmentation(path, parts, notes)
     if suffix in _SEQUENCES:
         drawn = read_sequence(path)
         stated = drawn.orientation if _STATED in drawn.fields else ""
@@ -334,6 +329,19 @@ def _masks(path: Path, parts: Sequence[str], notes: list[str]) -> _Masks:
     digits = [re.findall(r"[0-9]{1,19}", file.stem) for file in files]
     numbers = [int(each[-1]) for each in digits if each]
     return _Masks(map(_picture, files), len(files), numbers * (len({*numbers}) == len(files)))
+
+
+def _table_of(
+    drawn: _Masks, parts: Sequence[str], mask_part: str
+) -> tuple[tuple[str, ...], UInt8[np.ndarray, " 256"]]:
+    """Names of labels 1, 2, ..., and the label of each value."""
+    table = np.full(256, 1 if mask_part else _NO_PART, np.uint8)
+    table[0] = 0
+    if mask_part:
+        return (mask_part,), table
+    for value, label in (drawn.label_of or {n: n for n in range(1, len(parts) + 1)}).items():
+        table[value] = label
+    return tuple(parts), table
 
 
 def _picture(path: Path) -> Image:

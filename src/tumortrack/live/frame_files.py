@@ -76,8 +76,8 @@ class KnownFrames:
 
     def _plus(self, path: Path) -> None:
         for of, to, rows, error_mm in read_plus(path):
-            stated = {"error_mm": error_mm} if _is_error(error_mm) else {}
-            self.links.append(read_link(to, of, rows, str(path), **stated))
+            link = read_link(to, of, rows, str(path))
+            self.links.append(link._replace(error_mm=error_mm) if _is_error(error_mm) else link)
 
     def _keys(self, path: Path, name: str) -> None:
         content = calibration_keys(path)
@@ -98,8 +98,8 @@ class KnownFrames:
                 f"{path} has no places in two frames, in columns A_x, A_y, A_z, B_x ..."
             )
         b, a = frames
-        places = (table.numbers([f"{end}_{x}".lower() for x in "xyz"]) for end in frames)
-        self.fits.append(fit_link(b, a, *places, f"{len(table.rows)} touches, {path}"))
+        of_b, of_a = (table.numbers([f"{end}_{x}".lower() for x in "xyz"]) for end in frames)
+        self.fits.append(fit_link(b, a, of_b, of_a, f"{len(table.rows)} touches, {path}"))
 
     def link_tables(self) -> None:
         """Link what tables have, at the last time that all have. Of a body whose poses are known in
@@ -130,8 +130,8 @@ def _board_link(one: FilePoses, other: FilePoses, source: str) -> Link:
             corners.append(np.stack([transform_points(pose, _CORNERS_MM) for pose in poses]))
     if not corners:
         raise InputError(f"{source}: the two tables share no time; see the stamps.")
-    places = np.concatenate(corners, axis=1)
-    return fit_link(one.frame_id, other.frame_id, *places, f"{len(corners)} {source}")
+    b, a = np.concatenate(corners, axis=1)
+    return fit_link(one.frame_id, other.frame_id, b, a, f"{len(corners)} {source}")
 
 
 def _links(

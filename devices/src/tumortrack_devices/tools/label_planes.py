@@ -16,7 +16,7 @@ from jaxtyping import Float
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.evidence import Outline
 from tumortrack.core.geometry import Affine, Points, transform_points
-from tumortrack.core.ultrasound import border_px, part_borders_px, spread_px
+from tumortrack.core.ultrasound import PIXEL_MM, part_borders_px
 from tumortrack.io.ultrasound_files import read_image_to_probe
 from tumortrack.live.poses import PoseBuffer
 from tumortrack_devices.igtl.message import ProtocolError, unpack_labels
@@ -27,7 +27,6 @@ _MOVED_MM, _TURNED_COS, _RENEWED_NS = 3.0, np.cos(np.radians(5.0)), 500_000_000
 _SOONEST_NS = 100_000_000  # between images that are looked at
 # Places of a plane and planes in one frame: the fit keeps 200 places, and takes longer with each.
 _MOST_PLACES, _MOST_WAITING = 24, 5
-_PIXEL_MM = 0.005, 5.0
 
 
 class LabelPlanes:
@@ -38,7 +37,8 @@ class LabelPlanes:
     def __init__(
         self, parts: Sequence[str], part: str, axes: Affine, image_to_probe: Path | None
     ) -> None:
-        self._parts, self._part, self._axes = dict(enumerate(parts, start=1)), part, axes
+        self._parts = {1: part} if part else dict(enumerate(parts, start=1))
+        self._one, self._axes = bool(part), axes
         self._probe_from_image = image_to_probe and read_image_to_probe(image_to_probe)
         # When; to the probe, or the published frame, from (column, row, 0); and borders there.
         self._waiting = deque[tuple[int, Affine, dict[str, Points]]](maxlen=_MOST_WAITING)
@@ -50,7 +50,8 @@ class LabelPlanes:
         if abs(stamp_ns - self._heard_ns) < _SOONEST_NS:
             return
         self._heard_ns, (labels, from_pixel, lps) = stamp_ns, unpack_labels(content)
-        if not self._part and not 0 <= labels.min() <= labels.max() <= len(self._parts):
+        labels = labels != 0 if self._one else labels
+        if not 0 <= labels.min() <= labels.max() <= len(self._parts):
             names = ", ".join(f"{number} {name}" for number, name in self._parts.items())
             raise ProtocolError(
                 f"an IMAGE has the label {labels.max()}. Allowed: 0, {names}; with part= any."
@@ -60,12 +61,9 @@ class LabelPlanes:
         elif not lps:
             from_pixel = self._axes @ from_pixel
         across, down = np.linalg.norm(from_pixel[:3, :2], axis=0).tolist()
-        if not _PIXEL_MM[0] <= min(across, down) <= max(across, down) <= _PIXEL_MM[1]:
+        if not PIXEL_MM[0] <= min(across, down) <= max(across, down) <= PIXEL_MM[1]:
             raise ProtocolError(f"an IMAGE has pixels of {across:.4g} x {down:.4g} mm.")
-        if self._part:
-            borders = {self._part: spread_px(border_px(labels != 0), (across, down))}
-        else:
-            borders = part_borders_px(labels.astype(np.uint8), self._parts, (across, down))
+        borders = part_borders_px(labels.astype(np.uint8), self._parts, (across, down))
         places_mm, most = {}, max(_MOST_PLACES // max(len(borders), 1), 1)
         for part, border in borders.items():
             if count := min(len(border), most):
