@@ -20,6 +20,7 @@ from tumortrack.io.ply import write_cloud_ply
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.frame_files import KnownFrames
 from tumortrack.live.poses import COLUMNS, pose_row
+from ultrasound_objects import stamped, words, write_meta_image
 
 STEP_NS = 50_000_000
 PLACES = np.array([[0.0, 0, 150], [60, 10, 160], [-20, 50, 140], [30, -40, 170]])
@@ -97,6 +98,23 @@ def test_a_right_chain(tmp_path, capsys):
     assert all((picture[edge] == 255).all() for edge in (0, -1))
     status, said = frames(capsys, *files, "--to", "Tracker")
     np.testing.assert_allclose(said["first_from_frame"]["Probe"], TRACKER_PROBE, atol=1e-5)
+
+
+def test_a_recording_has_the_chain_of_its_last_valid_frame(tmp_path, capsys):
+    poses = np.array([TRACKER_PROBE, TRACKER_PROBE @ BUMP, TRACKER_PROBE])
+    fields = stamped({"ProbeToTracker": poses})
+    fields[2]["ProbeToTrackerTransformStatus"] = "INVALID"
+    scan = write_meta_image(
+        tmp_path / "scan.igs.mha",
+        np.zeros((3, 8, 8), np.uint8),
+        fields,
+        {"ImageToProbeTransform": words(PROBE_IMAGE)},
+    )
+    status, said = frames(capsys, scan, "--to", "Tracker")
+    assert status == 4  # of a camera nothing is known
+    found = said["first_from_frame"]
+    np.testing.assert_allclose(found["Probe"], TRACKER_PROBE @ BUMP, atol=1e-6)
+    np.testing.assert_allclose(found["Image"], TRACKER_PROBE @ BUMP @ PROBE_IMAGE, atol=1e-6)
 
 
 def test_a_missing_link_is_named_and_touches_give_it(tmp_path, capsys):

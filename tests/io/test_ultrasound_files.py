@@ -512,6 +512,14 @@ def test_values_of_no_part_images_in_colour_and_other_sizes_are_refused(tmp_path
         recording(tmp_path, BRIGHT, masks=tmp_path / "empty")
 
 
+def test_masks_without_poses_and_masks_of_a_table_are_refused(tmp_path):
+    folder = write_masks(tmp_path / "m")
+    with refused(InputError, "--poses"):
+        tt.read_ultrasound(folder, ("kidney", "tumor_1"))
+    with refused(InputError, "--masks"):
+        tt.read_ultrasound(folder, ("kidney",), masks=folder, poses=tmp_path / "poses.csv")
+
+
 def test_hostile_calibrations_are_refused(tmp_path):
     file = tmp_path / "plus.xml"
     for text in (

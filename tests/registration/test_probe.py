@@ -8,6 +8,7 @@ import pytest
 import tumortrack as tt
 from refused import refused
 from tumortrack.core.errors import InputError
+from tumortrack.core.report import Cause
 from tumortrack.core.ultrasound import ImageErrors, ProbeRecording
 from tumortrack.registration.probe import UNKNOWN, FoundErrors, believed
 from tumortrack.tracking.tracker import Tracker
@@ -74,6 +75,7 @@ def test_the_pose_does_not_take_up_what_a_steady_sweep_leaves_open(tracker, scen
     (probe,) = alone.report.probes
     assert "lag" in probe.undetermined
     assert alone.quality == "poor"
+    assert alone.assessment.causes[0].cause is Cause.PROBE
     off, bounds = off_mm(alone, scene), alone.assessment.bounds
     assert off.max() < max(bound.error_bound95_mm for bound in bounds.values())
     with_camera, without = (

@@ -49,6 +49,7 @@ _NEARLY = 0.9  # of the usual cost: nine tenths of the right fits cost less
 _GUESSED = (Cause.ANOTHER_PATIENT,)
 # Noise may be the cause of all else, and then tells no patient from another.
 _NOISY_MM, _OF_BAD_FITS = 1.0, (Cause.ANOTHER_PATIENT, Cause.DEFORMED)
+_OF_CAMERAS = Cause.HIDDEN, Cause.NOISE
 _HELPED_BY_A_VIEW = Cause.HIDDEN, Cause.ANOTHER_PATIENT, Cause.VIEW
 # Hidden shares of the near side, and the points' spread relative to the near side's.
 _HIDDEN, _MOSTLY_HIDDEN, _SMALL_SPREAD = 0.15, 0.3, 0.8
@@ -71,11 +72,13 @@ def explained(
     recent causes by failed check, which are not searched for again."""
     causes = causes_of(model, views, estimate, known)
     alone = isinstance(views[0].full_view, SensorCloud) and not len(views[0].full_view.points_mm)
-    # Touches hide nothing, and no camera can look elsewhere.
+    # Touches hide nothing and have no noise in depths, and no camera can look elsewhere.
     in_sight = estimate.report.in_sight
     hides = not alone and (in_sight is None or in_sight < _NOTHING_HIDES)
-    if not hides:
-        causes = tuple(c for c in causes if c.cause is not Cause.HIDDEN) or (Likely(Cause.VIEW),)
+    never = _OF_CAMERAS if alone else () if hides else (Cause.HIDDEN,)
+    causes = tuple(c for c in causes if c.cause not in never) or (Likely(Cause.VIEW),)
+    if any(probe.undetermined and probe.shift_std_mm for probe in estimate.report.probes):
+        causes = (Likely(Cause.PROBE), *(c for c in causes if c.cause is not Cause.VIEW))
     view = TOUCH_MORE if alone else where_to_look(estimate, views, hides)
     return causes, words(causes, view)
 

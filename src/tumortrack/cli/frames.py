@@ -21,10 +21,11 @@ class Frames:
 
     Attributes:
         file: calibration files, folders of `locate`, `plan` or `calibrate hand-eye`, poses of
-            cameras (JSON), PLUS configurations (.xml), live tf (ros2:FRAME); tables of
-            poses (.csv), NAME=TABLE saying of what, or of three or more places touched in two
-            frames (columns A_x, A_y, A_z, B_x, B_y, B_z, mm). Two tables of the poses of
-            one NAME, a board say, in two frames compare these. Earlier files make the chains.
+            cameras (JSON), PLUS configurations (.xml) and recordings (.mha, .nrrd), live tf
+            (ros2:FRAME); tables of poses (.csv), NAME=TABLE saying of what, or of three or more
+            places touched in two frames (columns A_x, A_y, A_z, B_x, B_y, B_z, mm). Two tables of
+            the poses of one NAME, a board say, in two frames compare these. Earlier files make the
+            chains.
         to: frame in which the others are given.
         same: A=B: two names of one frame.
         distance: of the organ from the camera, mm, where links are compared.

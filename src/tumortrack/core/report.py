@@ -239,23 +239,29 @@ class ProbeReport(_Value, frozen=True, kw_only=True):
     @property
     def message(self) -> str:
         late = "the poses lag the images" if self.lag_s < 0 else "images lag the poses"
-        said = [
-            f"{self.tool}: {self.planes} planes; {late} by {abs(self.lag_s):.2f} s "
-            f"(one deviation {self.lag_std_s:.2f})"
-        ]
-        for along, share, std in (
-            ("along the beam", self.depth, self.depth_std),
-            ("across it", self.width, self.width_std),
-        ):
-            longer = "shorter" if share < 0 else "longer"
-            said.append(
-                f"lengths {along} are {abs(share):.1%} {longer} than stated "
-                f"(one deviation {std:.1%})"
-            )
+        said = {
+            "lag": f"{late} by {abs(self.lag_s):.2f} s (standard deviation {self.lag_std_s:.2f})",
+            "depth": _longer("along the beam", self.depth, self.depth_std),
+            "width": _longer("across the beam", self.width, self.width_std),
+        }
+        known = [words for name, words in said.items() if name not in self.undetermined]
         if self.undetermined:
-            open_ = " and ".join(self.undetermined)
-            said.append(f"undetermined: {open_}; sweep forth and back over the organ's ends")
-        return "; ".join(said)
+            stds = {
+                "lag": f"the lag of its images ({self.lag_std_s:.2f} s)",
+                "depth": f"lengths along the beam ({self.depth_std:.1%})",
+                "width": f"lengths across it ({self.width_std:.1%})",
+            }
+            which = ", ".join(stds[name] for name in self.undetermined)
+            known.append(
+                f"undetermined, with the standard deviation: {which}; "
+                "sweep forth and back, over the organ's ends"
+            )
+        return f"{self.tool}, {self.planes} planes: {'; '.join(known)}"
+
+
+def _longer(along: str, share: float, std: float) -> str:
+    longer = "shorter" if share < 0 else "longer"
+    return f"lengths {along} are {abs(share):.1%} {longer} than stated (deviation {std:.1%})"
 
 
 class NextEvidence(_Value, frozen=True, kw_only=True):
@@ -385,6 +391,7 @@ class Cause(StrEnum):
     VIEW = auto()
     EVIDENCE = auto()
     NOISE = auto()
+    PROBE = auto()
 
 
 @dataclass(frozen=True)

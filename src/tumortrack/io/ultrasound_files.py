@@ -112,9 +112,7 @@ def read_recording(path: Path, parts: Sequence[str], asked: RecordingOptions) ->
     pose; a value of a mask is no part's.
     """
     of_table = asked.poses is not None
-    if of_table and asked.masks is not None:
-        raise InputError("--masks are of a sequence with poses; with --poses give masks alone.")
-    sequence = None if of_table else read_sequence(path)
+    sequence = _sequence(path, asked)
     known = _of_sequence(sequence) if sequence is not None else _of_table(asked.poses or path)
     goal, steps, edges = _steps(known.edges, asked, path)
     probe_from_image, frame_from_probe = _chained(edges, steps, asked.mm_per_pixel, path)
@@ -164,6 +162,23 @@ def read_recording(path: Path, parts: Sequence[str], asked: RecordingOptions) ->
     if lost:
         notes.append(f"{masks.name}: {len(lost)} images have no pose within 0.5 s: left out.")
     return replace(made, notes=tuple(notes))
+
+
+def _sequence(path: Path, asked: RecordingOptions) -> ImageSequence | None:
+    """None: a table has the poses."""
+    if asked.poses is not None:
+        if asked.masks is not None:
+            raise InputError("--masks are of a sequence with poses; with --poses give masks alone.")
+        return None
+    if path.suffix.lower() not in _SEQUENCES:
+        raise InputError(f"{path} are masks: nothing says where the probe was. Give --poses TABLE.")
+    return read_sequence(path)
+
+
+def recorded_transforms(path: Path) -> _Edges:
+    """What a sequence says, by (from, to): 4 x 4, or one for each frame, NaN where it is invalid.
+    Raises InputError: missing, damaged or too large."""
+    return _of_sequence(read_sequence(path)).edges
 
 
 def _of_table(path: Path) -> _Poses:

@@ -17,6 +17,7 @@ from tumortrack.core.geometry import IDENTITY, Points, transform_points
 from tumortrack.core.store import read_file
 from tumortrack.io.csv_tables import read_rows
 from tumortrack.io.plus_files import read_plus
+from tumortrack.io.ultrasound_files import recorded_transforms
 from tumortrack.live.calibration_file import calibration_keys
 from tumortrack.live.poses import FilePoses
 from tumortrack.live.spec import POSES
@@ -57,11 +58,14 @@ class KnownFrames:
                 return self._table(path, name)
             case ".xml":
                 return self._plus(path)
+            case ".mha" | ".mhd" | ".nrrd":
+                return self._recording(path)
             case ".json" | ".yaml" | ".yml" | ".calib":
                 return self._keys(path, name)
         raise InputError(
             f"{path} says nothing of frames. Allowed: JSON, YAML of easy_handeye, tables (.csv), "
-            "PLUS configurations (.xml), folders that commands wrote, and ros2:FRAME."
+            "PLUS configurations (.xml) and recordings (.mha, .nrrd), folders that commands wrote, "
+            "and ros2:FRAME."
         )
 
     def _listen(self, text: str) -> None:
@@ -78,6 +82,12 @@ class KnownFrames:
         for of, to, rows, error_mm in read_plus(path):
             link = read_link(to, of, rows, str(path))
             self.links.append(link._replace(error_mm=error_mm) if _is_error(error_mm) else link)
+
+    def _recording(self, path: Path) -> None:
+        for (of, to), poses in recorded_transforms(path).items():
+            known = np.reshape(poses, (-1, 4, 4))
+            if len(known := known[np.isfinite(known).all((1, 2))]):
+                self.links.append(read_link(to, of, known[-1], f"{path}, last frame"))
 
     def _keys(self, path: Path, name: str) -> None:
         content = calibration_keys(path)

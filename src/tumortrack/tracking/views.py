@@ -115,7 +115,7 @@ class ViewFile:
     ) -> tuple[SensorCloud, dict[str, Any]]:
         count, hint = len(cloud.points_mm), "--range" if range_mm else ""
         if self.path == NO_CLOUD:
-            words = "no cloud: the organ was touched alone."
+            words = "no cloud: the organ was touched or outlined alone."
             return cloud, {"file": "", "hint": "touches", "organ": 0, "of": 0, "message": words}
         if range_mm:
             cloud = crop_cloud(cloud, *range_mm)
