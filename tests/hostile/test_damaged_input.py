@@ -214,9 +214,9 @@ def read_known(path: Path) -> object:
     from tumortrack.report.frames import chain_lines, open_line
 
     (known := KnownFrames()).add(str(path))
-    known.at(0)
-    links = [*known.links, *(fit.link for fit in known.fits)]
-    graph = FrameGraph([*links, *links], "camera", known.frames)
+    known.link_tables()
+    links = [*known.links, *known.fits]
+    graph = FrameGraph([*links, *links], "camera")
     return [*chain_lines(graph), *map(open_line, graph.open_cycles())]
 
 
