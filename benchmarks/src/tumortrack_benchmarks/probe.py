@@ -103,7 +103,7 @@ def section_mm(mesh: Mesh, frame_from_image: Affine) -> Float64[np.ndarray, "n 2
 
 def _drawn(
     places_mm: Float64[np.ndarray, "n 2"], std_mm: float, rng: np.random.Generator
-) -> Float64[np.ndarray, "n 2"]:
+) -> Float64[np.ndarray, "m 2"]:
     """As a reader draws them: off by a smooth wave around their middle."""
     places_mm = spread_px(places_mm, (1.0, 1.0))
     away = places_mm - places_mm.mean(0) if len(places_mm) else places_mm
