@@ -249,9 +249,11 @@ def test_parameters_are_options_of_track_and_have_their_defaults(options):
     assert (parsed.source, parsed.sinks) == ("ros2:/depth", ("viewer", "moveit"))
     assert (parsed.range, parsed.box) == ((100, 400), (-1, -2, 3, 4, 5, 6))
     assert (parsed.whole, parsed.give_up) == (True, 7)
+    tools = options.command({"model": "M", "source": "s", "tool": ["", "a=file:A.csv", "b=ur:1"]})
+    assert tyro.cli(Track, args=tools[2:]).tool == ("a=file:A.csv", "b=ur:1")
     plain = tyro.cli(Track, args=options.command({"model": "M", "source": "s"})[2:])
     for name, option in options.OPTIONS.items():
-        if name not in ("executable", "model", "source", "sinks"):
+        if name not in ("executable", "model", "source", "sinks", "tool"):
             assert (getattr(plain, name) or "") == (option.default or ""), name
     with refused(ValueError, "source"):
         options.command({"model": "MODEL"})
@@ -358,3 +360,11 @@ def test_the_package_names_this_version():
     about = ET.parse(PACKAGE / "package.xml").getroot()
     assert about.findtext("version") == tumortrack.__version__
     assert f'version="{tumortrack.__version__}"' in (PACKAGE / "setup.py").read_text()
+
+
+def test_a_restart_writes_another_report(options, tmp_path):
+    asked = {"model": "M", "source": "s", "report": str(tmp_path / "r.json")}
+    for name in ("r.json", "r-2.json", "r-3.json"):
+        plain = tyro.cli(Track, args=options.command(asked)[2:])
+        assert plain.report == tmp_path / name
+        (tmp_path / name).write_text("{}")

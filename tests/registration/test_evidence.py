@@ -262,8 +262,10 @@ def test_touched_places_are_carried_as_the_tissue_goes():
     assert np.allclose(moved[2].places_mm, after.forward(TUMOR[:4]), atol=0.05)
     way_mm = np.linalg.norm(there_mm - at(BEHIND[0]))
     assert moved[0].std_mm == pytest.approx(np.hypot(1.0, 0.1 * way_mm), rel=0.01)
-    unsure = Touch(place_mm=at(BEHIND[0]), std_mm=6.0)
-    assert propagate([TrackedEvidence(unsure, TRUE)], TRUE) == ((), ())
+    unsure = TrackedEvidence(Touch(place_mm=at(BEHIND[0]), std_mm=6.0), TRUE)
+    assert propagate([unsure], TRUE)[1][0].std_mm == pytest.approx(6.0)  # as sure as it was
+    far = replace(TRUE, centre_mm=TRUE.centre_mm + [60.0, 0, 0])  # it now errs by 6 mm more
+    assert propagate([unsure, TrackedEvidence(pieces[0], TRUE)], far) == ((), ())
     many = [
         TrackedEvidence(Touch(place_mm=at(BEHIND[0]), stamp_ns=n + 1), TRUE) for n in range(900)
     ]

@@ -25,9 +25,9 @@ ITERATIONS = 20  # of a step; with 5 a body sags five times as far
 def vtk(path: str) -> dict[str, Any]:
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkFiltersVerdict import vtkMeshQuality
-    from vtkmodules.vtkIOLegacy import vtkUnstructuredGridReader
+    from vtkmodules.vtkIOLegacy import vtkGenericDataObjectReader
 
-    reader = vtkUnstructuredGridReader()
+    reader = vtkGenericDataObjectReader()
     reader.SetFileName(path)
     reader.ReadAllScalarsOn()
     reader.ReadAllVectorsOn()
@@ -38,15 +38,17 @@ def vtk(path: str) -> dict[str, Any]:
     quality.Update()
     angles = quality.GetOutput().GetFieldData().GetArray("Mesh Tetrahedron Quality")
 
+    cells = grid.GetPolys() if grid.IsA("vtkPolyData") else grid.GetCells()
+
     def arrays(data: Any) -> dict[str, Any]:
         found = (data.GetArray(n) for n in range(data.GetNumberOfArrays()))
         return {array.GetName(): vtk_to_numpy(array).tolist() for array in found}
 
     return {
         "title": reader.GetHeader(),
-        "types": np.unique(vtk_to_numpy(grid.GetCellTypesArray())).tolist(),
+        "types": sorted({grid.GetCellType(n) for n in range(grid.GetNumberOfCells())}),
         "nodes": vtk_to_numpy(grid.GetPoints().GetData()).tolist(),
-        "cells": vtk_to_numpy(grid.GetCells().GetConnectivityArray()).tolist(),
+        "cells": vtk_to_numpy(cells.GetConnectivityArray()).tolist(),
         "of_cells": arrays(grid.GetCellData()),
         "of_nodes": arrays(grid.GetPointData()),
         "least_degrees": angles.GetTuple(0)[0],

@@ -18,7 +18,7 @@ from tumortrack.core import store
 from tumortrack.core.colours import Colour
 from tumortrack.core.types import Mesh
 
-_VTK_TYPES = {3: 5, 4: 10}  # triangle, tetrahedron
+_TETRAHEDRON = 10  # VTK's number of that kind of cell
 _LONGEST = 255  # characters of a title in VTK
 
 
@@ -33,14 +33,16 @@ class Cells:
 
 
 def write_vtk(path: Path, title: str, cells: Cells) -> None:
-    """Write an unstructured grid. Raises StorageError: the disk refused."""
+    """Write an unstructured grid, of triangles polygons. Raises StorageError: the disk refused."""
     count, corners = cells.nodes.shape
     listed = np.column_stack([np.full(count, corners), cells.nodes])
+    flat = corners == 3
+    dataset, kind = ("POLYDATA", "POLYGONS") if flat else ("UNSTRUCTURED_GRID", "CELLS")
     text = [
         f"# vtk DataFile Version 3.0\n{' '.join(title.split())[:_LONGEST]}\nASCII\n",
-        f"DATASET UNSTRUCTURED_GRID\nPOINTS {len(cells.nodes_mm)} float\n",
-        *(_rows(cells.nodes_mm), f"CELLS {count} {listed.size}\n", _rows(listed)),
-        *(f"CELL_TYPES {count}\n", f"{_VTK_TYPES[corners]}\n" * count),
+        f"DATASET {dataset}\nPOINTS {len(cells.nodes_mm)} float\n",
+        *(_rows(cells.nodes_mm), f"{kind} {count} {listed.size}\n", _rows(listed)),
+        *([] if flat else [f"CELL_TYPES {count}\n", f"{_TETRAHEDRON}\n" * count]),
     ]
     text += [f"CELL_DATA {count}\n"] * bool(cells.of_cells)
     for name, values in cells.of_cells.items():

@@ -32,7 +32,7 @@ SURFACE_MM = 1.0  # of the model's surfaces, segmentation included: ``sigma_mm``
 _FALSE, _WITHIN_MM = 0.05, 40.0
 _RIGID_MM = 4.0  # error of the undeformed organ at best
 _DRIFT = 0.1  # error along an axis of where tissue is said to go, per way that it went
-_OLD_MM = 5.0  # what is less sure tells nothing any more
+_OLD_MM = 5.0  # of what it errs by having moved since; with more it tells nothing
 MOST_PLACES = (
     1000  # places: with so many an answer takes a second, or several where they contradict it
 )
@@ -292,10 +292,10 @@ def propagate(
         ends = np.cumsum([len(each.piece.places) for each in mine])[:-1]
         parts = zip(mine, np.split(moved_mm, ends), np.split(away_mm, ends), strict=True)
         for each, moved, away in parts:
-            std_mm = math.hypot(each.piece.std_mm, _DRIFT * float(away.mean()))
-            if std_mm <= _OLD_MM:
+            drift_mm = _DRIFT * float(away.mean())
+            if drift_mm <= _OLD_MM:
                 kept.append(each)
-                pieces.append(each.piece.at(moved, std_mm))
+                pieces.append(each.piece.at(moved, math.hypot(each.piece.std_mm, drift_mm)))
     return tuple(kept), tuple(pieces)
 
 

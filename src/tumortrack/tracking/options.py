@@ -167,7 +167,7 @@ class TrackOptions(CameraOptions):
             (ros2:FIXED_FRAME) or a robot (ur:HOST). If those are poses of a tool, --frame has
             tool_from_camera.
         tool: NAME=KIND:..., a tool that touches or holds the organ, or outlines that are drawn
-            (file:TABLE.csv, ur:HOST, ros2:TF_FRAME, openigtlink:HOST:PORT); repeatable.
+            (file:TABLE.csv, ur:HOST, ros2:TF_FRAME, crtk:/PSM1, openigtlink:HOST:PORT); repeatable.
         advise: as for `locate`.
         scan: with --moving: begin with three looks at the organ at rest, 30 degrees apart, within
             5 s; tracking starts from all three together.

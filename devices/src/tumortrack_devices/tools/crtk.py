@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from tumortrack.core.geometry import Affine
 from tumortrack.live.poses import PoseBuffer
@@ -37,7 +37,7 @@ class CrtkToolConfig(TipConfig, frozen=True, kw_only=True, tag="crtk"):
     target: ClassVar[str] = "namespace"
 
     namespace: str
-    pose: str = "measured_cp"
+    pose: Literal["measured_cp", "local/measured_cp", "setpoint_cp"] = "measured_cp"
     jaw: str = "jaw/measured_js"
     closed_deg: float = 10.0
     via: Via = "auto"
@@ -47,7 +47,7 @@ class CrtkToolConfig(TipConfig, frozen=True, kw_only=True, tag="crtk"):
         check_topic("pose", f"{self.namespace}/{self.pose}")
         if self.jaw:
             check_topic("jaw", f"{self.namespace}/{self.jaw}")
-        self.check_between("crtk:", closed_deg=(-30, 90))
+        self.check_between("crtk:", closed_deg=(0, 90))
 
     def open(self, context: SinkContext, name: str) -> CrtkTool:
         return CrtkTool(self, context, name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 
@@ -17,12 +18,13 @@ class Option(NamedTuple):
 
 REQUIRED = ("model", "source")
 # What a run is about: only while the node is not active. The others start tracking anew.
-FIXED = {"executable", *REQUIRED, "sinks", "patient", "side", "device", "report"}
+FIXED = {"executable", *REQUIRED, "sinks", "tool", "patient", "side", "device", "report"}
 OPTIONS = {
     "executable": Option("tumortrack", "the command, with its folder if it is not on the PATH"),
     "model": Option("", "a case, or the folder of a model"),
     "source": Option("", "where frames come from, such as ros2:/camera/depth/image_rect_raw"),
     "sinks": Option(["ros2:/tumortrack"], "where results go; also moveit, viewer"),
+    "tool": Option([""], "NAME=KIND:..., tools that touch or hold the organ"),
     "frame": Option("", "JSON file that says where the camera is"),
     "moving": Option("", "where a camera that moves is, such as ros2:base_link (tf)"),
     "patient": Option("", "whose organ it is; a model of another patient is refused"),
@@ -36,9 +38,18 @@ OPTIONS = {
     "give_up": Option(60.0, "end after so many s without a frame", (0.01, 1e6)),
     "seconds": Option(0.0, "end so many s after the first frame; 0: never", (0.0, 1e9)),
     "device": Option("auto", "auto, cpu or cuda", ("auto", "cpu", "cuda")),
-    "report": Option("", "file for latencies, counts and reasons"),
+    "report": Option("", "file for latencies, counts and reasons; NAME-2 of a restart"),
 }
 _LISTS = {"range": 2, "box": 6}  # so many numbers in one text
+
+
+def _new(report: str) -> str:
+    """A file that is not there yet: no run replaces another's."""
+    path, number = Path(report), 1
+    while report and path.exists():
+        number += 1
+        path = Path(report).with_stem(f"{Path(report).stem}-{number}")
+    return str(path) if report else ""
 
 
 def command(values: Mapping[str, Any]) -> list[str]:
@@ -52,6 +63,8 @@ def command(values: Mapping[str, Any]) -> list[str]:
         check(name, value)
     arguments = [known.pop("executable"), "track", *(known.pop(name) for name in REQUIRED)]
     arguments += known.pop("sinks")
+    arguments += [f"--tool={tool}" for tool in known.pop("tool") if tool]
+    known["report"] = _new(known["report"])
     for name, value in known.items():
         if value is False or value == "":
             continue
