@@ -29,9 +29,14 @@ def scene(phantom_case):
     return tt.simulate_scenes(phantom_case, seed=5)[0]
 
 
+SWEPT: dict[Sweep, ProbeRecording] = {}  # each takes seconds
+
+
 def swept(scene, **changed) -> ProbeRecording:
     sweep = Sweep(errors=changed.pop("errors", ERRORS), **changed)
-    return record(scene.reference, sweep, np.random.default_rng(3))
+    if sweep not in SWEPT:
+        SWEPT[sweep] = record(scene.reference, sweep, np.random.default_rng(3))
+    return SWEPT[sweep]
 
 
 def off_mm(estimate, scene):
@@ -156,3 +161,43 @@ def test_recordings_are_of_one_answer_not_of_a_stream(tracker, scene):
         tracker.follow(scene.cloud, evidence=[recording])
     with refused(InputError):
         tracker.locate(scene.cloud, evidence=[recording], frame="Tracker")
+
+
+def stills(scene) -> ProbeRecording:
+    """Twelve planes of a sweep, each held still, a minute apart; nothing tells their lag."""
+    every = swept(scene, errors=ImageErrors(), pose_std_mm=0.0)
+    chosen = np.linspace(5, every.plane.max() - 5, 12).round().astype(int)
+    mine = np.isin(every.plane, chosen)
+    number = np.searchsorted(chosen, every.plane[mine])
+    return replace(
+        every, stamps_s=60.0 * np.arange(12), frame_from_probe=every.frame_from_probe[chosen],
+        places_px=every.places_px[mine], part=every.part[mine], plane=number,
+        image_stamps_s=60.0 * number,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("camera", [True, False])
+def test_planes_of_a_probe_at_rest_have_no_lag_and_count_all_the_same(tracker, scene, camera):
+    estimate = located(tracker, scene, camera, [stills(scene)])
+    (probe,) = estimate.report.probes
+    assert "lag" in probe.undetermined
+    assert probe.lag_s == pytest.approx(0.0, abs=1e-6)
+    assert probe.lag_std_s == pytest.approx(0.5, rel=0.01)  # as before anything was known
+    assert off_mm(estimate, scene).mean() < 1.5
+    assert all(not each.rejected for each in estimate.report.evidence)
+
+
+def test_recordings_without_poses_and_of_other_parts_are_refused(tracker, scene):
+    recording = swept(scene)
+    late = replace(recording, image_stamps_s=recording.image_stamps_s + 1000)
+    with refused(InputError, "probe"):
+        located(tracker, scene, True, [late])
+    with refused(InputError, "liver"):
+        located(tracker, scene, True, [replace(recording, parts=("liver", *recording.parts[1:]))])
+    for poses in (slice(1), slice(None, None, -1)):
+        with refused(InputError, "probe"):
+            replace(
+                recording,
+                stamps_s=recording.stamps_s[poses],
+                frame_from_probe=recording.frame_from_probe[poses],
+            )

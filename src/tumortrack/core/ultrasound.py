@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt8
 
+from tumortrack.core.errors import InputError
 from tumortrack.core.evidence import Outline
 from tumortrack.core.geometry import Affine, Points, rigid, transform_points
 
@@ -68,6 +69,10 @@ class ProbeRecording:
     shared_std_mm: float = 0.0
     camera_from_frame: Affine = field(default_factory=lambda: np.eye(4))
     notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.stamps_s) < 2 or not (np.diff(self.stamps_s) > 0).all():
+            raise InputError(f"{self.tool}: there must be two poses or more, with rising stamps.")
 
     def places_mm(self, errors: ImageErrors = NO_ERRORS) -> Points:
         """Of all places in the frame of the answer; NaN where no pose is known."""

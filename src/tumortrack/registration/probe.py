@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Points
 from tumortrack.core.report import ProbeReport
 from tumortrack.core.ultrasound import NO_ERRORS, ImageErrors, ProbeRecording
@@ -35,6 +36,7 @@ _STARTS_S = (0.0, -0.6, 0.6)  # of the lag: a descent from farther off may end b
 _DIFFERENCE = np.array([0.5, 0.005, 0.005])
 _STEPS, _ROBUST_STEPS = 20, 6  # at most; so many before places are judged as true or false
 _ENOUGH = 0.002  # of the priors' deviations: the last step
+_FEWEST = 0.5  # share of the places that must have a pose
 _LARGEST_MM = 20.0  # of what a place may be off: farther away it tells nothing
 
 
@@ -50,8 +52,8 @@ class FoundErrors:
     def left_open_mm(self, recording: ProbeRecording) -> tuple[float, float]:
         """Standard deviations that they leave: of all places alike, along the worst axis, and of
         each beside that, along any."""
-        _, by_errors = _places(recording, self.errors)
-        by_errors = by_errors[np.isfinite(by_errors).all((1, 2))]
+        places_mm, by_errors = _places(recording, self.errors)
+        by_errors = by_errors[np.isfinite(places_mm).all(1)]
         mean = by_errors.mean(0)
         away = by_errors - mean
         alike_mm2 = np.linalg.eigvalsh(mean @ self.covariance @ mean.T)[-1]
@@ -98,7 +100,8 @@ def find_errors(
     smooth = recording.smoothed()
     starts = (ImageErrors(lag_s=lag_s) for lag_s in _STARTS_S)
     found = [_descend(smooth, motion, precision, off, start) for start in starts]
-    return min(found, key=lambda each: each.cost)
+    best = min(found, key=lambda each: each.cost)
+    return UNKNOWN if math.isinf(best.cost) else best
 
 
 def _descend(
@@ -115,7 +118,9 @@ def _descend(
     off = np.concatenate([off_motion, np.zeros(3), errors])  # from the priors' means
     for step in range(_STEPS):
         places_mm, by_errors = _places(recording, errors)
-        known = np.isfinite(by_errors).all((1, 2))
+        known = np.isfinite(places_mm).all(1)
+        if known.mean() <= _FEWEST:
+            return FoundErrors(errors, UNKNOWN.covariance, math.inf)
         places_mm, by_errors = places_mm[known] + off[count : count + 3], by_errors[known]
         terms = _terms(recording, motion, places_mm, known).at(motion)
         terms = terms.judged if step >= _ROBUST_STEPS else terms
@@ -147,15 +152,19 @@ def _descend(
 def _places(
     recording: ProbeRecording, errors: ImageErrors
 ) -> tuple[Points, Float64[np.ndarray, "n 3 3"]]:
-    """And what each error does to them."""
-
-    def moved(number: int, by: float) -> Points:
-        changed = np.array(errors)
-        changed[number] += by
-        return recording.places_mm(ImageErrors(*changed.tolist()))
-
-    by_errors = [(moved(n, by) - moved(n, -by)) / (2 * by) for n, by in enumerate(_DIFFERENCE)]
-    return recording.places_mm(errors), np.stack(by_errors, axis=2)
+    """And what each error does to them: nothing, where no pose is known beside theirs."""
+    places_mm, by_errors = recording.places_mm(errors), list[Points]()
+    for number, by in enumerate(_DIFFERENCE.tolist()):
+        ends, known = list[Points](), np.zeros(len(places_mm))
+        for sign in (-1, 1):
+            changed = np.array(errors)
+            changed[number] += sign * by
+            moved_mm = recording.places_mm(ImageErrors(*changed.tolist()))
+            inside = np.isfinite(moved_mm).all(1)
+            ends.append(np.where(inside[:, None], moved_mm, places_mm))
+            known += inside
+        by_errors.append((ends[1] - ends[0]) / (by * np.maximum(known, 1))[:, None])
+    return places_mm, np.stack(by_errors, axis=2)
 
 
 def _terms(
@@ -166,6 +175,8 @@ def _terms(
 ) -> EvidenceTerms:
     """Of some of its places; a plane is a piece."""
     names = list(motion.shape.anatomy_ct.closed)
+    if unknown := sorted({*recording.parts} - {*names}):
+        raise InputError(f"{recording.tool} shows {unknown[0]!r}; this organ has {names}.")
     numbers = np.array([names.index(name) for name in recording.parts])
     zeros, none = np.zeros(len(places_mm)), np.zeros((0, 3))
     return EvidenceTerms(

@@ -165,6 +165,8 @@ class Tracker:
             raise InputError("recordings need a model that knows a motion: give the case itself.")
         for recording in recordings:
             assert isinstance(locator, RegistrationLocator)
+            if not len(recording.known_mm):
+                raise InputError(f"{recording.tool}: no place in its images has a pose in time.")
             most = (MOST_PLACES - sum(len(each.places) for each in known)) // len(recordings)
             thinned = recording.thinned(max(most, FEWEST_TOUCHES))
             views, others, cloud = all_views, known, all_views[0].cloud
