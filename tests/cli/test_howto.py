@@ -23,9 +23,10 @@ PAGES = sorted((Path(__file__).parents[2] / "docs" / "how-to").glob("*.md"))
 LEFT = {  # what a page's commands leave behind, besides what they print
     "camera": ("RUN/metadata.yaml", "again.json", "PACKED/metadata.yaml"),
     "ct": ("CASE/qc.png", "RUN/tumor_2.ply", "RUN_WITH_POINTS/points.csv"),
+    "dvrk": ("frames.png",),
     "evaluate": ("REPORT/index.html",),
     "evidence": ("RUN/report.json", "TOUCHED/tumor_1.ply"),
-    "frames": ("frames.png", "right.json"),
+    "frames": ("frames.png",),
     "organ": ("LIVER/liver.ply",),
     "plan": ("PLAN/plan.png",),
     "poor-answer": ("RUN/index.html",),
@@ -60,8 +61,8 @@ def desk(tmp_path, page, phantom_case, elastic_model):
     case = load_case(phantom_case)
     cloud = cloud_by_rays(case, looking_down(case)).astype(np.float32)
     write_cloud_ply(tmp_path / "cloud.ply", cloud)
-    if page.stem == "frames":
-        shutil.copytree(PAGES[0].parents[2] / "examples" / "frames", tmp_path, dirs_exist_ok=True)
+    if (example := PAGES[0].parents[2] / "examples" / page.stem).is_dir():
+        shutil.copytree(example, tmp_path, dirs_exist_ok=True)
     else:
         write_touches(tmp_path / "touches.csv", case)
     points = case.anatomy.tumors[0].vertices_mm[:3]

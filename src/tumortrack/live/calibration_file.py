@@ -150,7 +150,7 @@ def _easy_handeye(path: Path) -> dict[str, Any]:
     return {"unit": "m", _TOOL if moves else "robot_from_camera": pose, **frames}
 
 
-def _dvrk_registration(path: Path, arm: str, axes: str) -> dict[str, Any]:
+def _dvrk_registration(path: Path, robot: str, axes: str) -> dict[str, Any]:
     """The keys of a ``CalibrationFile`` from what dvrk_camera_registration writes, in metres: where
     the arm's own base (``PSM1_base``, that of ``local/measured_cp``) is before the camera. dVRK's
     axes of the camera are OpenCV's turned by half about its axis, and come without braces."""
@@ -159,7 +159,7 @@ def _dvrk_registration(path: Path, arm: str, axes: str) -> dict[str, Any]:
     if "measured_cp" in data:
         raise InputError(
             f"{path} is of a camera that an ECM holds, and where that was is not in it. Give "
-            f"{arm}-registration-open-cv.json, which was written beside it."
+            f"{robot}-registration-open-cv.json, which was written beside it."
         )
     base = from_builtins(data, _DvrkFile, str(path)).base_frame
     camera_from_base = read_rigid(base.transform, "m", f"{path}: transform")
@@ -167,4 +167,4 @@ def _dvrk_registration(path: Path, arm: str, axes: str) -> dict[str, Any]:
         camera_from_base[:2] *= -1
     name = "" if base.reference_frame == _UNNAMED else base.reference_frame
     pose = {"unit": "mm", "camera_from_robot": camera_from_base.tolist()}
-    return {**pose, "frame_id": f"{arm}_base", "camera_frame_id": name}
+    return {**pose, "frame_id": f"{robot}_base", "camera_frame_id": name}
