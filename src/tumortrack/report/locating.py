@@ -9,19 +9,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from tumortrack.assessment.bound import depths_within_mm
 from tumortrack.core import store
 from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.evidence import CAMERA, Evidence
-from tumortrack.core.ultrasound import ProbeRecording
+from tumortrack.core.evidence import CAMERA
 from tumortrack.core.wording import for_caller
-from tumortrack.io.evidence_files import read_evidence
 from tumortrack.io.points import PointTable, check_near_organ, read_points
-from tumortrack.io.ultrasound_files import RecordingOptions, is_recording, read_recording
-from tumortrack.live.calibration_file import read_frames
 from tumortrack.report.seen import PAGE, Seen
 from tumortrack.tracking.options import LocateOptions, check_grid, model_folder
 from tumortrack.tracking.views import (
@@ -114,17 +108,18 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
     views = read_views(clouds, options)
     hints = views[0].hints(options.at, options.mask)
 
+    from tumortrack.report.known_evidence import read_known
     from tumortrack.tracking.model_files import load_model
     from tumortrack.tracking.tracker import Tracker
 
     model = load_model(folder, options.device)
-    frame, evidence, notes = _known(options, model.parts, clouds[0] != NO_CLOUD)
+    known = read_known(options, model.parts, clouds[0] != NO_CLOUD)
     tracker = Tracker(model, options.advise)
     about: dict[str, Any] = {
         "notes": [
             *(weakness.message for weakness in model.warnings),
             *_notes(views, points, tracker.anatomy_ct, options),
-            *notes,
+            *known.notes,
         ],
         "input": [],
         "model": model.provenance,
@@ -140,11 +135,11 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
         estimate = tracker.locate(
             organs[0],
             views=others,
-            evidence=evidence,
+            evidence=known.pieces,
             full_view=views[0].content,
             grid=options.grid,
             seed=options.seed,
-            frame=frame,
+            frame=known.frame,
         )
     except NoEstimate as error:
         about["input"] = [organ.entry for organ in found]
@@ -176,62 +171,16 @@ def locate(given: Path, clouds: Sequence[Path], options: LocateOptions) -> Locat
             "clouds_sha256": [store.sha256_of(path) for path in clouds],
         }
     about["notes"] += [probe.message for probe in estimate.report.probes]
-    if frame != CAMERA:
-        about["notes"].append(f"all places are in the frame {frame!r}: the organ may lie any way.")
-    if options.evidence:
-        digests = [store.sha256_of(path) for path in options.evidence if path.exists()]
-        about["evidence_sha256"] = digests[0] if len(digests) == 1 else digests
+    if known.frame != CAMERA:
+        about["notes"].append(
+            f"all places are in the frame {known.frame!r}: the organ may lie any way."
+        )
+    about |= known.sha256
     if options.map is not None and points is not None:
         digest, count = store.sha256_of(options.map), len(points.points_ct)
         about["map"] = {"points": count, "from": "lps", "to": "camera", "sha256": digest}
     about["notes"] = list(map(for_caller, about["notes"]))
     return Located(estimate, about, seen, points)
-
-
-def _known(
-    options: LocateOptions, parts: Sequence[str], with_camera: bool
-) -> tuple[str, tuple[Evidence | ProbeRecording, ...], list[str]]:
-    """The frame of all evidence, its pieces, and notes on reading it."""
-    recorded = [path for path in options.evidence if is_recording(path)]
-    of_probe = options.poses is not None and options.poses.suffix.lower() == ".csv"
-    asked = RecordingOptions(
-        masks=options.masks,
-        mask_part=options.mask_part,
-        poses=options.poses if of_probe else None,
-        mm_per_pixel=options.mm_per_pixel,
-        image_to_probe=options.image_to_probe,
-    )
-    if not recorded and (asked != RecordingOptions() or options.frame is not None):
-        raise InputError(
-            "--frame, --masks, --mask-part, --mm-per-pixel, --image-to-probe and a table of --poses"
-            " are of tracked ultrasound: give it as --evidence."
-        )
-    if recorded and with_camera and options.frame is None:
-        raise InputError(
-            f"where the camera is in the frame of {recorded[0]} is not known: give --frame FILE,"
-            " or - instead of the cloud."
-        )
-    published = None if options.frame is None else read_frames(options.frame)
-    frames, pieces, notes = set[str](), list[Evidence | ProbeRecording](), list[str]()
-    for path in options.evidence:
-        if path not in recorded:
-            frame, evidence = read_evidence(path, with_camera)
-            frames, pieces = {*frames, frame}, [*pieces, *evidence]
-            continue
-        goal = "" if published is None else published.frame_id
-        recording = read_recording(path, parts, replace(asked, frame=goal))
-        if published is not None:
-            pose = np.linalg.inv(published.published_from_camera)
-            recording = replace(recording, camera_from_frame=pose)
-            away_mm = np.nanmax(np.linalg.norm(recording.places_mm(), axis=1))
-            if (error_mm := published.error_at(float(away_mm))) is not None:
-                recording = replace(recording, shared_std_mm=error_mm)
-        frames = {*frames, recording.frame if published is None else CAMERA}
-        notes += recording.notes
-        pieces.append(recording)
-    if len(frames) > 1:
-        raise InputError(f"--evidence is in the frames {', '.join(sorted(frames))}; give one.")
-    return frames.pop() if frames else CAMERA, tuple(pieces), notes
 
 
 def _points(given: Path, folder: Path, options: LocateOptions) -> PointTable | None:
