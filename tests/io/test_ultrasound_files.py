@@ -16,9 +16,11 @@ from refused import refused
 from stories import cloud_by_rays, looking_down, refusal, tumortrack
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.store import sha256_of
 from tumortrack.io.case import load_case
+from tumortrack.io.csv_tables import COLUMNS
 from tumortrack.io.ply import write_cloud_ply
-from tumortrack.live.poses import COLUMNS, pose_row
+from tumortrack.live.poses import pose_row
 from ultrasound_objects import keys_of, stamped, words, write_meta_image, write_nrrd
 
 # Not square, off the middle, and 40 x 20 mm in the image: turned or flipped it lies elsewhere.
@@ -512,6 +514,14 @@ def test_values_of_no_part_images_in_colour_and_other_sizes_are_refused(tmp_path
         recording(tmp_path, BRIGHT, masks=tmp_path / "empty")
 
 
+def test_a_file_of_several_pages_is_no_mask(tmp_path):
+    pages = [Image.fromarray(page.astype(np.uint8)) for page in LABELS[:2]]
+    (tmp_path / "m").mkdir()
+    pages[0].save(tmp_path / "m" / "0.tif", save_all=True, append_images=pages[1:])
+    with refused(InputError, "0.tif", "2 images"):
+        recording(tmp_path, BRIGHT, masks=tmp_path / "m")
+
+
 def test_masks_without_poses_and_masks_of_a_table_are_refused(tmp_path):
     folder = write_masks(tmp_path / "m")
     with refused(InputError, "--poses"):
@@ -613,6 +623,8 @@ def test_a_sweep_says_where_the_organ_is_with_and_without_a_camera(
     report, off = centres_off(tmp_path / "seen", case, camera_from_ct)
     assert max(off.values()) < 1.0
     assert {each["name"] for each in report["evidence"]} == {"outline"}
+    assert report["evidence_sha256"] == sha256_of(scan)
+    assert report["ultrasound_sha256"] == {"frame": [sha256_of(tmp_path / "camera.json")]}
     done = tumortrack("locate", elastic_model, "-", *common, "--out", tmp_path / "alone")
     assert done.returncode in (0, 4), done.stderr
     report, off = centres_off(tmp_path / "alone", case, TRACKER_FROM_CAMERA @ camera_from_ct)

@@ -332,8 +332,6 @@ def read_mask(path: Path, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
 
 def _image(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, str]:
     """An image's values without its transparency, and its Pillow mode."""
-    from PIL import Image
-
     if path.suffix.lower() == ".npy":
         array = _npy(read_file(path, LARGEST_FILE), str(path))
         if array.shape != (size[1], size[0]):
@@ -342,15 +340,24 @@ def _image(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, str]:
             )
         return array, "F" if array.dtype.kind == "f" else "I"
     with readable(path, "is no 16-bit PNG or TIFF, or TIFF of 32-bit floats, that can be read"):
-        content = io.BytesIO(read_file(path, LARGEST_FILE))
-        image = Image.open(content, formats=["PNG", "TIFF", "BMP"])
-        if (count := getattr(image, "n_frames", 1)) > 1:
-            raise InputError(f"{path} holds {count} images. Save the one that is meant.")
+        image = open_picture(path, LARGEST_FILE)
         if image.size == size:  # known from the header, before anything is decoded
             opaque = image.convert("RGB") if image.mode in ("RGBA", "LA", "PA") else image
             return np.asarray(opaque), image.mode
     given, stated = (f"{width} x {height}" for width, height in (image.size, size))
     raise InputError(f"{path} is {given}; it must be {stated}, as its intrinsics say.")
+
+
+def open_picture(path: Path, largest_file: int) -> Any:
+    """A Pillow image, of which the header alone is decoded. Raises InputError: missing, too large,
+    or several images."""
+    from PIL import Image
+
+    content = io.BytesIO(read_file(path, largest_file))
+    image = Image.open(content, formats=["PNG", "TIFF", "BMP"])
+    if (count := getattr(image, "n_frames", 1)) > 1:
+        raise InputError(f"{path} holds {count} images. Save the one that is meant.")
+    return image
 
 
 def depth_png(frame: DepthFrame, compress_level: int = 6) -> bytes:

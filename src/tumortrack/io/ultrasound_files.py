@@ -7,7 +7,6 @@ images in the orientation MF (https://pluslib.readthedocs.io, Coordinate system 
 from __future__ import annotations
 
 import glob
-import io
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -20,9 +19,10 @@ from jaxtyping import Bool, Float64, UInt8
 from tumortrack.core.config import Config, from_builtins
 from tumortrack.core.errors import InputError, readable
 from tumortrack.core.geometry import Affine, spacing_mm
-from tumortrack.core.store import natural, read_file, read_json
+from tumortrack.core.store import natural, read_json
 from tumortrack.core.ultrasound import PIXEL_MM, ProbeRecording, part_borders_px
 from tumortrack.io.csv_tables import read_pose_table
+from tumortrack.io.depth_files import open_picture
 from tumortrack.io.plus_files import read_plus
 from tumortrack.io.segments import is_organ, is_tumor, painted
 from tumortrack.io.sequence_files import (
@@ -360,12 +360,8 @@ def _table_of(
 
 
 def _picture(path: Path) -> Image:
-    from PIL import Image as Pillow
-
     with readable(path, "is no image that can be read"):
-        image = Pillow.open(
-            io.BytesIO(read_file(path, _LARGEST_FILE)), formats=["PNG", "BMP", "TIFF"]
-        )
+        image = open_picture(path, _LARGEST_FILE)
         if image.width * image.height > _MOST_PIXELS:
             raise InputError(f"{path} is {image.width} x {image.height} pixels: too large.")
         opaque = {"RGBA": "RGB", "LA": "L", "PA": "P"}.get(image.mode)
