@@ -71,13 +71,14 @@ def explained(
     """Causes of a poor estimate, and what probably happened and what to do, in words. ``known``:
     recent causes by failed check, which are not searched for again."""
     causes = causes_of(model, views, estimate, known)
-    alone = isinstance(views[0].full_view, SensorCloud) and not len(views[0].full_view.points_mm)
+    alone = views[0].of_no_camera
     # Touches hide nothing and have no noise in depths, and no camera can look elsewhere.
     in_sight = estimate.report.in_sight
     hides = not alone and (in_sight is None or in_sight < _NOTHING_HIDES)
     never = _OF_CAMERAS if alone else () if hides else (Cause.HIDDEN,)
     causes = tuple(c for c in causes if c.cause not in never) or (Likely(Cause.VIEW),)
-    if any(probe.undetermined and probe.shift_std_mm for probe in estimate.report.probes):
+    probes = estimate.report.probes if check_of(estimate) == "place" else ()
+    if any(probe.undetermined and probe.shift_std_mm for probe in probes):
         causes = (Likely(Cause.PROBE), *(c for c in causes if c.cause is not Cause.VIEW))
     view = TOUCH_MORE if alone else where_to_look(estimate, views, hides)
     return causes, words(causes, view)

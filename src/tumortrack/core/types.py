@@ -296,6 +296,11 @@ class View(Renamed):
     def __post_init__(self) -> None:
         _freeze(self, "camera_from_view", np.float64, (4, 4))
 
+    @property
+    def of_no_camera(self) -> bool:
+        """Whether there is nothing, or but what was touched or outlined: no camera saw it."""
+        return isinstance(self.full_view, SensorCloud) and not len(self.full_view.points_mm)
+
 
 @dataclass(frozen=True, eq=False)
 class OccupancyCloud:

@@ -33,9 +33,7 @@ _FALSE, _WITHIN_MM = 0.05, 40.0
 _RIGID_MM = 4.0  # error of the undeformed organ at best
 _DRIFT = 0.1  # error along an axis of where tissue is said to go, per way that it went
 _OLD_MM = 5.0  # of what it errs by having moved since; with more it tells nothing
-MOST_PLACES = (
-    1000  # places: with so many an answer takes a second, or several where they contradict it
-)
+MOST_PLACES = 1000  # with so many an answer takes a second, several where they contradict it
 _MOST_KEPT = 200  # from frame to frame, the newest: a frame then takes three times as long
 
 
@@ -78,17 +76,17 @@ class Terms:
         """As the points' cost: for small residuals their squares, in standard deviations."""
         squares = (self.residuals_mm / self.width_mm) ** 2
         alone = (self.width_mm / self.std_mm) ** 2 @ (squares / (1 + squares))
-        return float(alone - self.shifts @ self.own_precision @ self.shifts)
+        return float(alone - self.shifts @ self._own_precision @ self.shifts)
 
     @cached_property
-    def own_precision(self) -> Float64[np.ndarray, "s s"]:
+    def _own_precision(self) -> Float64[np.ndarray, "s s"]:
         return np.eye(self.by_shifts.shape[1]) + (self.by_shifts.T * self.weights) @ self.by_shifts
 
     @cached_property
     def shifts(self) -> Float64[np.ndarray, " s"]:
         """The most likely at this motion, in standard deviations."""
         slope = (self.by_shifts.T * self.weights) @ self.residuals_mm
-        return -np.linalg.solve(self.own_precision, slope)
+        return -np.linalg.solve(self._own_precision, slope)
 
     @property
     def contradicting(self) -> Int64[np.ndarray, " k"]:
@@ -105,7 +103,7 @@ class Terms:
         weighted = self.by_motion.T * self.weights
         across = weighted @ self.by_shifts
         curvature += weighted @ self.by_motion
-        curvature -= across @ np.linalg.solve(self.own_precision, across.T)
+        curvature -= across @ np.linalg.solve(self._own_precision, across.T)
         gradient += weighted @ (self.residuals_mm + self.by_shifts @ self.shifts)
         return self.cost
 

@@ -71,7 +71,7 @@ class RegistrationLocator:
         ``views`` and ``evidence``, or, where these are the recording's own places, its elasticity
         alone."""
         frame, fit, _ = self._registered(views, seed, evidence, any_pose)
-        if _is_alone(views):
+        if views[0].of_no_camera:
             shape = fit.motion.shape
             precision = prior_precision(shape, self._model.config.refine)
             precision[:POSE] = precision[:, :POSE] = 0.0  # it may lie anywhere
@@ -110,7 +110,7 @@ class RegistrationLocator:
     def _registered(
         self, views: Sequence[View], seed: int, evidence: Sequence[Evidence], any_pose: bool
     ) -> tuple[Frame, RegistrationResult, Registration]:
-        fewest = FEWEST_TOUCHES if _is_alone(views) else FEWEST_POINTS
+        fewest = FEWEST_TOUCHES if views[0].of_no_camera else FEWEST_POINTS
         frame = Frame(self._model, views[0].cloud, seed, np.random.default_rng(seed), fewest)
         points = self._points(
             frame, views, evidence=EvidenceTerms.from_evidence(evidence, self._touchable)
@@ -216,9 +216,3 @@ class RegistrationLocator:
         if np.linalg.norm(behind_mm, axis=1).max() >= _BEHIND_MM:
             return refined, 0.0
         return replace(refined, motion=mean), past_s * (1 - share) / share
-
-
-def _is_alone(views: Sequence[View]) -> bool:
-    """Whether no camera saw anything: places that were touched or outlined are the cloud."""
-    full_view = views[0].full_view
-    return isinstance(full_view, SensorCloud) and not len(full_view.points_mm)

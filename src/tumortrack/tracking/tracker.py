@@ -169,11 +169,13 @@ class Tracker:
                 raise InputError(f"{recording.tool}: no place in its images has a pose in time.")
             most = (MOST_PLACES - sum(len(each.places) for each in known)) // len(recordings)
             thinned = recording.thinned(max(most, FEWEST_TOUCHES))
-            views, others, cloud = all_views, known, all_views[0].cloud
-            if alone := not len(cloud.points_mm):
+            views, others, alone = all_views, known, all_views[0].of_no_camera
+            if alone:
                 outlines = believed(thinned, UNKNOWN).outlines()
+                cloud = all_views[0].cloud
                 views, _, others = _alone(cloud, (*known, *outlines), self.model.parts[0])
-            found = locator.errors_of(thinned, views, seed, others, any_pose)
+            with self._explaining_errors(views, _DEFAULTS, touched=True):
+                found = locator.errors_of(thinned, views, seed, others, any_pose)
             pieces += believed(thinned, found).outlines(found.errors)
             reports.append(found.report(thinned, alone))
         return pieces, tuple(reports)
