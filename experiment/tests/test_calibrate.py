@@ -17,9 +17,10 @@ from tumortrack.core.config import to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.types import DepthFrame
+from tumortrack.io.csv_tables import COLUMNS
 from tumortrack.io.depth_files import depth_png, intrinsics_json, read_depth_png
 from tumortrack.live.calibration_file import read_frames
-from tumortrack.live.poses import COLUMNS, pose_row
+from tumortrack.live.poses import pose_row
 from tumortrack.live.values import Observation
 from tumortrack_devices.recording.mcap import STRING, McapBag, camera_messages
 from tumortrack_devices.ros.messages import Messages, Outgoing

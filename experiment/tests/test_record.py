@@ -19,7 +19,7 @@ from record_objects import SPEC, SmallBenchConfig
 from refused import refused
 from tumortrack.cli.main import run
 from tumortrack.core.errors import InputError
-from tumortrack.live.poses import COLUMNS
+from tumortrack.io.csv_tables import COLUMNS
 from tumortrack.live.spec import SOURCES
 from tumortrack.live.values import SourceEnded
 from tumortrack_experiment.record.attachments import attachments_of

@@ -16,10 +16,11 @@ from tumortrack.cli.main import run
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Affine, rigid, transform_points
 from tumortrack.io.case import load_case
+from tumortrack.io.csv_tables import COLUMNS
 from tumortrack.io.ply import write_cloud_ply
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.frame_files import KnownFrames
-from tumortrack.live.poses import COLUMNS, pose_row
+from tumortrack.live.poses import pose_row
 from ultrasound_objects import stamped, words, write_meta_image
 
 STEP_NS = 50_000_000

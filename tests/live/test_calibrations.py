@@ -14,9 +14,9 @@ from live_objects import STAMP_NS, small_update
 from refused import refused
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
+from tumortrack.io.csv_tables import COLUMNS
 from tumortrack.live.calibration_file import read_frames
 from tumortrack.live.cameras import camera_setup
-from tumortrack.live.poses import COLUMNS
 from tumortrack.live.values import PublishedFrame
 
 PSM2_OPEN_CV, PSM2_DVRK = (f"PSM2-registration-{axes}.json" for axes in ("open-cv", "dVRK"))

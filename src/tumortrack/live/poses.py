@@ -12,8 +12,6 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import IDENTITY, Affine, rigid
 from tumortrack.core.report import Finding
-from tumortrack.io.csv_tables import COLUMNS as COLUMNS
-from tumortrack.io.csv_tables import CONTACT as CONTACT
 from tumortrack.io.csv_tables import read_pose_table
 from tumortrack.live.values import Observation
 

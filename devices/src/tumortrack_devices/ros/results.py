@@ -129,17 +129,20 @@ class ResultMessages:
             send("/diagnostics", DIAGNOSTICS, header=header, status=status)
         self._levels = levels
         if self._context.controller is not None:
-            self._add_arms(result, send, send_markers)
+            self._add_arms(result, header, send, send_markers)
             if self._observed and (points := self._points(result)) is not None:
                 seen = plain_cloud(SensorCloud(points, result.stamp_ns), header, self._messages)
                 out.append(Outgoing("observed", CLOUD, seen))
         return out
 
     def _add_arms(
-        self, result: TrackingResult, send: Callable[..., None], send_markers: Callable[..., None]
+        self,
+        result: TrackingResult,
+        header: Any,
+        send: Callable[..., None],
+        send_markers: Callable[..., None],
     ) -> None:
-        """Their joints and shapes. The header is the result's."""
-        header = self._messages.header(result.stamp_ns, result.published_frame.frame_id)
+        """Their joints and shapes."""
         joints = {} if result.control is None else result.control.joints_rad
         angles = np.array(list(joints.values()), np.float64)
         send("joint_states", JOINTS, header=header, name=list(joints), position=angles)

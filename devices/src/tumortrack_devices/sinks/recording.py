@@ -13,8 +13,9 @@ import tumortrack
 from tumortrack.core.config import to_builtins
 from tumortrack.core.store import write_json, writing
 from tumortrack.core.types import SensorCloud
+from tumortrack.io.csv_tables import COLUMNS
 from tumortrack.io.run_folder import report_entry
-from tumortrack.live.poses import COLUMNS, pose_row
+from tumortrack.live.poses import pose_row
 from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 from tumortrack_devices.recording.folders import ABOUT
 from tumortrack_devices.recording.mcap import STRING, McapBag, camera_messages, evidence_message

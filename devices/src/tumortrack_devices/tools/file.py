@@ -7,7 +7,8 @@ from typing import ClassVar
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Affine
-from tumortrack.live.poses import COLUMNS, CONTACT, FilePoses
+from tumortrack.io.csv_tables import COLUMNS, CONTACT
+from tumortrack.live.poses import FilePoses
 from tumortrack.live.values import SinkContext
 from tumortrack_devices.tools.tip import TipConfig, TipTool
 
