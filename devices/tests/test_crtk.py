@@ -4,9 +4,8 @@ speaks is a real rclpy."""
 from __future__ import annotations
 
 import sys
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from clock import Clock, until
 from live_objects import PARTS, STAMP_NS, empty_update, small_anatomy, small_setting, small_update
 from refused import refused
 from reports import advised, bounded
-from ros2_objects import Other, own_graph, process
+from ros2_objects import Other, own_graph, process, published_again
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.evidence import Touch
 from tumortrack.core.geometry import rigid, transform_points
@@ -72,26 +71,6 @@ def known() -> TrackingResult:
     return replace(update, estimate=replace(estimate, motion=motion))
 
 
-@contextmanager
-def published_again(update: TrackingResult) -> Iterator[None]:
-    """For a listener that may not be matched yet."""
-    sink, done = Ros2SinkConfig(via="dds").open(small_setting()), threading.Event()
-
-    def again() -> None:
-        while not done.is_set():
-            sink.publish(update)
-            done.wait(0.1)
-
-    thread = threading.Thread(target=again)
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join()
-        sink.close()
-
-
 def heard_by(slicer: Other, update: TrackingResult) -> dict[str, dict]:
     """The last message of each topic."""
     last: dict[str, dict] = {}
@@ -103,7 +82,10 @@ def heard_by(slicer: Other, update: TrackingResult) -> dict[str, dict]:
             verdicts.append(message["text"])  # topics race: all are of this update with the third
         return len(verdicts) > 2 and len(last) == 3 + 2 * len(PARTS)
 
-    with published_again(update):
+    with (
+        closing(Ros2SinkConfig(via="dds").open(small_setting())) as sink,
+        published_again(sink, update),
+    ):
         slicer.lines_until(all_are_there)
     return last
 
@@ -160,7 +142,7 @@ def test_a_method_that_knows_no_covariance_says_so() -> None:
 
 
 class Arm:
-    """Sends what a CRTK arm sends, when it is told, on a bus of its own."""
+    """Sends what a CRTK arm sends, on request, on a bus of its own."""
 
     def __init__(self, bus: Bus) -> None:
         self._messages = bus.messages

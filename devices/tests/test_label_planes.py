@@ -100,7 +100,7 @@ def image_message(image, stamp_s, **about):
 
 
 def outlines(tool):
-    """What the tool gives in a frame; it is told that the organ is found."""
+    """What the tool gives in a frame; it learns that the organ is found."""
     now_ns = time.time_ns()
     view = CameraView(1, Observation(small_frame(now_ns), now_ns), TRACKER_FROM_CAMERA)
     pieces = tool.evidence(view)

@@ -6,7 +6,6 @@ import contextlib
 import shutil
 import signal
 import subprocess
-import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -36,6 +35,7 @@ from ros2_objects import (
     own_graph,
     peer,
     process,
+    published_again,
     read_until,
     sending,
 )
@@ -207,20 +207,8 @@ def at(last: dict[str, dict], stamp_ns: int) -> bool:
 
 def publish_until(sink: Sink, other: Other, update: TrackingResult) -> dict[str, dict]:
     """Publish until the other end hears it on all topics; it may not be matched yet."""
-    done = threading.Event()
-
-    def again() -> None:
-        while not done.is_set():
-            sink.publish(update)
-            done.wait(0.1)
-
-    thread = threading.Thread(target=again)
-    thread.start()
-    try:
+    with published_again(sink, update):
         return other.topics_until(lambda last: at(last, update.stamp_ns))
-    finally:
-        done.set()
-        thread.join()
 
 
 @pytest.mark.slow

@@ -259,6 +259,13 @@ def test_parameters_are_options_of_track_and_have_their_defaults(options):
         options.command({"model": "MODEL"})
 
 
+def node_command(**parameters: object) -> tuple[str, ...]:
+    """That runs the node."""
+    begin = "from tumortrack_ros.track_node import main; main()"
+    given = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
+    return sys.executable, "-c", begin, "--ros-args", *given
+
+
 def test_a_parameter_that_tracking_refuses_is_set_back_and_it_goes_on(tmp_path):
     """The node in a real ROS 2, and programs that call its service, and set its parameters as
     `ros2 param` does."""
@@ -268,10 +275,7 @@ def test_a_parameter_that_tracking_refuses_is_set_back_and_it_goes_on(tmp_path):
     cases = f"case $* in *nonsense*) exit 2;; *over*) {over};; esac"
     program.write_text(f'#!/bin/sh\necho "$*" >> {started}\n{cases}\nexec sleep 99\n')
     program.chmod(0o755)
-    begin = "from tumortrack_ros.track_node import main; main()"
-    given = {"executable": program, "model": "M", "source": "ros2:/depth"}
-    options = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
-    command = sys.executable, "-c", begin, "--ros-args", *options
+    command = node_command(executable=program, model="M", source="ros2:/depth")
     with own_graph():
         environment = clients.environment("ros-jazzy-rclpy")
         environment["PYTHONPATH"] += f"{os.pathsep}{PACKAGE}"
@@ -306,10 +310,7 @@ def test_the_node_is_one_whose_life_others_manage(tmp_path):
     ended = "trap 'echo ended >> {0}; exit 0' INT; while :; do sleep 0.1; done"
     program.write_text(f'#!/bin/sh\necho "$*" >> {started}\n{ended.format(started)}\n')
     program.chmod(0o755)
-    begin = "from tumortrack_ros.track_node import main; main()"
-    given = {"executable": program, "source": "ros2:/depth", "autostart": "false"}
-    options = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
-    command = sys.executable, "-c", begin, "--ros-args", *options
+    command = node_command(executable=program, source="ros2:/depth", autostart="false")
 
     def told(*words: str) -> list[dict]:
         with peer(*words, by=RCLPY) as other:

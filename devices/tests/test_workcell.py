@@ -77,7 +77,7 @@ def test_joints_and_markers_say_where_everything_stands():
     for shape, marker in zip(cell.shapes, links, strict=True):
         assert marker.type == marker.TRIANGLE_LIST
         assert (marker.color.r, marker.color.a) == (shape.colour[0] / 255, 1.0)
-        assert (marker.frame_locked, marker.lifetime.sec) == (True, 0)  # until it is told otherwise
+        assert (marker.frame_locked, marker.lifetime.sec) == (True, 0)  # until it is replaced
     assert_drawn(links, out["/tf"], cell.shapes)
     # Later transforms carry what was drawn before along.
     results = ResultMessages(HUMBLE, with_arms())

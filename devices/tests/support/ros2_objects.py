@@ -21,7 +21,7 @@ from clock import PATIENCE_S, until
 from live_objects import PARTS, small_anatomy, small_frame
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import SensorCloud
-from tumortrack.live.values import Observation, Source
+from tumortrack.live.values import Observation, Sink, Source, TrackingResult
 from tumortrack_devices.ros.bus import Bus, open_bus
 from tumortrack_devices.ros.sensors import messages_seen
 
@@ -179,3 +179,22 @@ def peer(*arguments: object, by: str = OURS) -> Iterator[Other]:
     environment = None if by == OURS else clients.environment("ros-jazzy-rclpy")
     with process(sys.executable, IDENTITY / script, *arguments, environment=environment) as other:
         yield other
+
+
+@contextmanager
+def published_again(sink: Sink, update: TrackingResult) -> Iterator[None]:
+    """Ten times a second, for a listener that may not be matched yet."""
+    done = threading.Event()
+
+    def again() -> None:
+        while not done.is_set():
+            sink.publish(update)
+            done.wait(0.1)
+
+    thread = threading.Thread(target=again)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()

@@ -17,7 +17,7 @@ class Option(NamedTuple):
 
 
 REQUIRED = ("model", "source")
-# What a run is about: only while the node is not active. The others start tracking anew.
+# What a run is about: only while the node is not active. The others restart tracking.
 FIXED = {"executable", *REQUIRED, "sinks", "tool", "patient", "side", "device", "report"}
 OPTIONS = {
     "executable": Option("tumortrack", "the command, with its folder if it is not on the PATH"),

@@ -1,5 +1,5 @@
 """Runs ``tumortrack track`` with the node's parameters, while the node is active; a parameter that
-is set then starts it anew."""
+is set then restarts it."""
 
 from __future__ import annotations
 
