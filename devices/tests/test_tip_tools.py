@@ -24,7 +24,8 @@ from tumortrack.core.assessment import NOT_JUDGED
 from tumortrack.core.errors import InputError
 from tumortrack.core.evidence import FreeSpace, Grasp, Landmark, Outline, Touch
 from tumortrack.core.geometry import rigid, transform_points
-from tumortrack.live.poses import COLUMNS, CONTACT, pose_row
+from tumortrack.io.csv_tables import COLUMNS, CONTACT
+from tumortrack.live.poses import pose_row
 from tumortrack.live.tools import Tools
 from tumortrack.live.values import CameraView, Observation, PublishedFrame
 from tumortrack_devices.igtl import message as igtl

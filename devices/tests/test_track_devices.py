@@ -21,8 +21,8 @@ from track_objects import PATIENT, World, ended_when, start, told, virtual, wait
 from tumortrack.core.camera import d405, project
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
+from tumortrack.io.csv_tables import COLUMNS, CONTACT
 from tumortrack.live.calibration_file import read_frames
-from tumortrack.live.poses import COLUMNS, CONTACT
 from tumortrack.live.values import SourceEnded
 from tumortrack_devices.sources.recording import RecordingSourceConfig
 
