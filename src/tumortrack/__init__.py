@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from tumortrack.assessment.advice import advise as advise
     from tumortrack.core import errors as errors
     from tumortrack.core.estimate import Estimate as Estimate
+    from tumortrack.core.evidence import Cut as Cut
     from tumortrack.core.evidence import FreeSpace as FreeSpace
     from tumortrack.core.evidence import Grasp as Grasp
     from tumortrack.core.evidence import Landmark as Landmark
@@ -43,7 +44,7 @@ _NAMES = {  # by the module that has them
     "track train train_tissue_classifier write_scenes",
     "core": "errors",
     "core.estimate": "Estimate",
-    "core.evidence": "FreeSpace Grasp Landmark Outline Touch",
+    "core.evidence": "Cut FreeSpace Grasp Landmark Outline Touch",
     "core.types": "DepthFrame Intrinsics View SensorCloud",
     "core.ultrasound": "ProbeRecording",
     "io.case": "Case load_case",

@@ -41,25 +41,32 @@ class _Evidence(Config, frozen=True, kw_only=True, tag_field="kind"):
         for field in ("tip_mm", "point_std_mm", "shared_std_mm"):
             if field in self.__struct_fields__:
                 self.check_between(self.name, **{field: (0.0, 50.0)})
-        for field in ("place_mm", "places_mm", "point_ct"):
-            if field not in self.__struct_fields__:
+        for field in ("place_mm", "places_mm", "point_ct", "points_ct"):
+            if field not in self.__struct_fields__ or field in self._left_out:
                 continue
             try:
                 places = np.array(getattr(self, field))
             except ValueError:  # rows of different lengths
                 places = np.zeros(0)
-            dimensions = 1 + (field == "places_mm")
+            dimensions = 1 + (field in ("places_mm", "points_ct"))
             right = places.ndim == dimensions and places.shape[-1] == 3 and places.size
             if not right or places.dtype.kind not in "iuf":
-                raise InputError(f"{self.name}: {field} is x, y, z, and places_mm one or more.")
+                raise InputError(
+                    f"{self.name}: {field} is x, y, z, one or more where it is plural."
+                )
             if not (np.abs(places) <= _REACH_MM).all():
                 raise InputError(
                     f"{self.name}: {field} reaches {np.abs(places).max():g}; allowed: up to "
                     f"{_REACH_MM:g} mm, places in the camera's frame, points of the CT in LPS."
                 )
-            if field != "point_ct" and np.abs(places).max() < _LEAST_MM:
+            if not field.endswith("_ct") and np.abs(places).max() < _LEAST_MM:
                 raise InputError(f"{self.name}: {field} lies at the camera: is it in metres?")
             msgspec.structs.force_setattr(self, field, _tuples(places))
+
+    @property
+    def _left_out(self) -> tuple[str, ...]:
+        """Fields that need no value."""
+        return ()
 
     @property
     def name(self) -> str:
@@ -130,7 +137,34 @@ class FreeSpace(_Evidence, frozen=True, kw_only=True, tag="free_space"):
     std_mm: float = 1.0
 
 
-Evidence: TypeAlias = Touch | Landmark | Grasp | Outline | FreeSpace
+class Cut(_Evidence, frozen=True, kw_only=True, tag="cut"):
+    """Where an electrode has cut: places along all of it that was energised in tissue, some
+    millimetres apart at most: of the CT (``points_ct``, LPS, mm), or of the organ as it lay at
+    ``stamp_ns`` (``places_mm``). Cuts do not heal: each answer needs all of them. ``kerf_mm``: how
+    wide a gap is left."""
+
+    lasting: ClassVar[bool] = False  # what is cut is kept as a body's shape, not as evidence
+    places_mm: tuple[Point, ...] = ()
+    points_ct: tuple[Point, ...] = ()
+    kerf_mm: float = 1.5
+    std_mm: float = 1.0
+
+    def __post_init__(self) -> None:
+        if bool(self.places_mm) == bool(self.points_ct):
+            raise InputError("cut: give places_mm (camera frame) or points_ct (CT), one of them.")
+        super().__post_init__()
+        self.check_between(self.name, kerf_mm=(0.1, 20.0))
+
+    @property
+    def _left_out(self) -> tuple[str, ...]:
+        return tuple(field for field in ("places_mm", "points_ct") if not getattr(self, field))
+
+    def of_ct(self, points_ct: Points) -> Cut:
+        """The same at points of the CT."""
+        return msgspec.structs.replace(self, places_mm=(), points_ct=_tuples(points_ct))
+
+
+Evidence: TypeAlias = Touch | Landmark | Grasp | Outline | FreeSpace | Cut
 FREE = str(FreeSpace.__struct_config__.tag)
 # Names of kinds that are said again in each frame, as long as they are so.
 MOMENTARY = {str(kind.__struct_config__.tag) for kind in get_args(Evidence) if not kind.lasting}

@@ -58,14 +58,15 @@ def _checked(given: dict[str, Any], where: str, with_camera: bool) -> EvidenceFi
 
 
 _PLACE, _POINT = ("x_mm", "y_mm", "z_mm"), ("x_ct_mm", "y_ct_mm", "z_ct_mm")
-_SIZES = ("std_mm", "shared_std_mm", "tip_mm", "point_std_mm")
+_SIZES = ("std_mm", "shared_std_mm", "tip_mm", "point_std_mm", "kerf_mm")
 _NEEDED = ("piece", "frame", "kind", *_PLACE)
 _READ: dict[str, Callable[[str, str], float]] = {
     **dict.fromkeys((*_PLACE, *_POINT, *_SIZES), number_in),
     "stamp_ns": whole_in,
 }
 _FURTHER = (*_READ, "part", "tool")
-_OF_PLACES = ("outline", "free_space")
+_OF_PLACES = ("outline", "free_space", "cut")
+_OF_CT = "ct"  # frame of a table's cuts that are in the CT (LPS)
 
 
 def _table(path: Path, with_camera: bool) -> tuple[str, tuple[Evidence, ...]]:
@@ -89,6 +90,8 @@ def _table(path: Path, with_camera: bool) -> tuple[str, tuple[Evidence, ...]]:
     for where, given, places in pieces.values():
         several = given["kind"] in _OF_PLACES
         given |= {"places_mm": places} if several else {"place_mm": places[0]}
+        if given["kind"] == "cut" and given["frame"] == _OF_CT:
+            given |= {"frame": CAMERA, "points_ct": given.pop("places_mm")}
         whole = {"frame": given.pop("frame"), "unit": "mm", "evidence": [given]}
         one = _checked(whole, where, with_camera)
         found, frames = [*found, *one.evidence], frames | {one.frame}

@@ -126,6 +126,7 @@ class LatticeSolid:
             tumor = np.maximum(tumor, _filled(part, lattice))
         near = binary_dilation((organ > 0).reshape(lattice.cells), np.ones((3, 3, 3))).ravel()
         self.lattice, self.poisson = lattice, poisson
+        self.cells = np.argwhere(near.reshape(lattice.cells))  # those kept
         # The filled fraction of each cell kept.
         self.organ, self.tumor = organ[near], np.minimum(tumor, organ)[near]
         corners = lattice.corner_nodes(np.indices(lattice.cells).reshape(3, -1).T[near])
@@ -173,15 +174,22 @@ class LatticeSolid:
     @cached_property
     def usual_factor(self) -> BlockCholesky:
         """The factor for ``CONTRAST``, kept: responses and compliance ask for it."""
-        return self._factor(CONTRAST)
+        return self.factor_of(self.moduli(CONTRAST))
 
     def factor(self, contrast: float) -> BlockCholesky:
         """Factor of the stiffness with tumors ``contrast`` times as stiff as the organ; the rigid
         motions are held very softly."""
-        return self.usual_factor if contrast == CONTRAST else self._factor(contrast)
+        if contrast == CONTRAST:
+            return self.usual_factor
+        return self.factor_of(self.moduli(contrast))
 
-    def _factor(self, contrast: float) -> BlockCholesky:
-        stiffness = self.stiffness(np.maximum(self.organ, VOID) + (contrast - 1) * self.tumor)
+    def moduli(self, contrast: float) -> Float64[np.ndarray, " c"]:
+        """Of each cell, over the organ's, with tumors ``contrast`` times as stiff."""
+        return np.maximum(self.organ, VOID) + (contrast - 1) * self.tumor
+
+    def factor_of(self, moduli: Float64[np.ndarray, " c"]) -> BlockCholesky:
+        """As ``factor``, for any stiffness of the cells."""
+        stiffness = self.stiffness(moduli)
         inertia = np.repeat(self.volume_mm3 / self.volume_mm3.max(), 3)
         held = stiffness + diags(_ANCHOR * stiffness.diagonal().max() * inertia)
         return BlockCholesky(held.tocsr(), [3 * b for b in self.bounds])

@@ -20,7 +20,7 @@ from tumortrack.core.geometry import triangles_of, unit
 from tumortrack.core.mesh_kernels import farthest
 from tumortrack.core.process import parallel_map
 from tumortrack.core.types import Mesh
-from tumortrack.organ.finite import CONTRAST, LatticeSolid
+from tumortrack.organ.finite import BlockCholesky, LatticeSolid
 
 LEVER_MM = 50.0  # a rotation's unknown is the motion at this lever arm
 _FORCED = 150  # places of forces for the compliance; 80 leave nearly the same errors
@@ -68,7 +68,7 @@ def modes_of(
     """``count`` modes of the responses to loads (f, n) with the tumors' contrasts in turn, as
     displacements of the solid's nodes: a unit coefficient moves the organ by 1 mm rms. The last
     mode swells the organ; the others keep its volume."""
-    rigid = _RigidMotions.from_solid(solid)
+    rigid = RigidMotions.from_solid(solid)
     mass, forces = rigid.mass, rigid.balanced(np.column_stack([loads, solid.swelling]))
     responses = np.empty_like(forces)
 
@@ -93,22 +93,23 @@ def modes_of(
 
 
 def compliance_modes(
-    solid: LatticeSolid, patches: Patches, count: int
+    solid: LatticeSolid, patches: Patches, count: int, factor: BlockCholesky | None = None
 ) -> Float64[np.ndarray, "f k"]:
     """How the organ yields to forces anywhere on its surface, as displacements of the solid's
     nodes: the ``count`` principal components of its responses to independent forces along three
     axes at ``_FORCED`` places, balanced by inertia. With independent coefficients N(0, 1) of all
-    components the surface moves by 1 mm rms along each axis. Source: forces anywhere, without
-    boundary conditions, as in BCF-FEM (Yang et al. 2024, arXiv 2403.09964)."""
+    components the surface moves by 1 mm rms along each axis. ``factor``: of another stiffness than
+    the usual one. Source: forces anywhere, without boundary conditions, as in BCF-FEM (Yang et al.
+    2024, arXiv 2403.09964)."""
     points_mm, areas = patches.points_mm, patches.areas_mm2
     chosen = np.empty((1, min(_FORCED, len(areas))), np.int64)
     farthest(np.ascontiguousarray(points_mm.T[None], np.float32), np.zeros(1, np.int64), chosen)
     radius_mm = np.sqrt(areas.sum() / chosen.size) / 2
     spots = np.stack([patches.spot(place, radius_mm) * areas for place in points_mm[chosen[0]]], 1)
     forces = np.einsum("pn,de->pdne", spots / spots.sum(0), np.eye(3)).reshape(len(areas), 3, -1)
-    rigid = _RigidMotions.from_solid(solid)
+    rigid = RigidMotions.from_solid(solid)
     balanced = rigid.balanced(_at_nodes(forces, solid, patches))
-    responses = rigid.removed(solid.factor(CONTRAST).solve(balanced))
+    responses = rigid.removed((factor or solid.usual_factor).solve(balanced))
     shares = np.sqrt(areas / areas.sum())[:, None, None]
     moved = (solid.at(points_mm, responses) * shares).reshape(3 * len(areas), -1)
     squares, mixes = np.linalg.eigh(moved.T @ moved)
@@ -116,7 +117,7 @@ def compliance_modes(
 
 
 @dataclass(frozen=True, eq=False)
-class _RigidMotions:
+class RigidMotions:
     """Of a solid's nodes."""
 
     motions: Float64[np.ndarray, "f 6"]
@@ -124,7 +125,7 @@ class _RigidMotions:
     inverse: Float64[np.ndarray, "6 6"]  # of the motions' inner products
 
     @classmethod
-    def from_solid(cls, solid: LatticeSolid) -> _RigidMotions:
+    def from_solid(cls, solid: LatticeSolid) -> RigidMotions:
         arms, axes = solid.nodes_mm - solid.center_mm, np.eye(3)
         turns = [np.cross(axis, arms).ravel() for axis in axes]
         motions = np.stack([*(np.tile(axis, len(arms)) for axis in axes), *turns], 1)

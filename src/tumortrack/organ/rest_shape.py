@@ -131,6 +131,8 @@ class RestShape:
     anatomy_ct: Anatomy
     body: ElasticBody
     distances: tuple[DistanceField, ...]
+    flap_modes: int = 0  # of the body's, the last ones: see ``registration.flap``
+    intact: RestShape | None = None  # before it was cut
 
     @cached_property
     def compliant(self) -> RestShape:

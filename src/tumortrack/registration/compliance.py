@@ -86,7 +86,8 @@ def refine_compliance(fit: RegistrationResult, config: GaussNewtonConfig) -> Ref
     terms = None if views.evidence is None else views.evidence.at(start)
     std_mm, spread = Groups.near(fit, means, config, terms, scale).select_best()
     of_library = prior_precision(fit.motion.shape, config)
-    of_library[POSE:, POSE:] /= spread**2
+    states = slice(POSE, len(of_library) - fit.motion.shape.flap_modes)
+    of_library[states, states] /= spread**2
     precision = _blocks(of_library, _precision_of_forces(near, len(of_library), std_mm))
     at = Linear.at(start, fit.pose_offset, near, views, precision, terms, scale)
     steps = 1 if terms is None else 2  # more leave the same errors; evidence is judged on the way
@@ -236,7 +237,7 @@ class Groups:
 
     Attributes:
         distances_mm: at the fit; ``at_mean_mm``: with the unknowns at their prior's mean.
-        by_pose_mm2: the distances' covariance by the pose and what neighbours share;
+        by_pose_mm2: the distances' covariance by the pose, a flap, and what neighbours share;
             ``by_library_mm2``: by the states; ``by_compliance_mm2``: by the compliance with a
             standard deviation of 1 mm.
         weights: of the distances' squares in the cost.
@@ -275,13 +276,17 @@ class Groups:
         by_library, by_compliance, distances_mm = np.split(means, [POSE + len(body.mean), -1], 1)
         pose_std = np.repeat([config.shift_mm, config.turn_rad], 3)
         by_pose = by_library[:, :POSE] * pose_std
-        by_states = by_library[:, POSE:]
+        by_states, covariance = by_library[:, POSE:], body.covariance
+        library = len(covariance) - fit.motion.shape.flap_modes
+        by_flap = by_states[:, library:]
+        shared += by_flap @ covariance[library:, library:] @ by_flap.T
+        by_states, covariance = by_states[:, :library], covariance[:library, :library]
         off = np.append(fit.pose_offset, fit.motion.coefficients - body.mean)
         return cls(
             distances_mm=np.ascontiguousarray(distances_mm[:, 0]),
             at_mean_mm=distances_mm[:, 0] - by_library @ off,
             by_pose_mm2=by_pose @ by_pose.T + shared,
-            by_library_mm2=by_states @ body.covariance @ by_states.T,
+            by_library_mm2=by_states @ covariance @ by_states.T,
             by_compliance_mm2=by_compliance @ by_compliance.T,
             weights=weights,
             width_mm=width_mm,

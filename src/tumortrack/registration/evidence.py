@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from tumortrack.core.errors import InputError
-from tumortrack.core.evidence import Evidence, FreeSpace, Grasp, Landmark, Outline, Touch
+from tumortrack.core.evidence import Cut, Evidence, FreeSpace, Grasp, Landmark, Outline, Touch
 from tumortrack.core.geometry import Affine, transform_points
 from tumortrack.core.mesh_query import surface_distance
 from tumortrack.core.report import EvidenceReport
@@ -135,6 +135,7 @@ class EvidenceTerms:
         surfaces, points = list[tuple[Any, ...]](), list[tuple[Any, ...]]()
         tools = dict[str, float]()
         for number, each in enumerate(evidence):
+            assert not isinstance(each, Cut)  # it changes the shape: see ``flap``
             tool_name = (each.shared_std_mm and each.tool) or f"piece {number}"
             tools[tool_name] = max(each.shared_std_mm, tools.get(tool_name, 0.0))
             about = number, list(tools).index(tool_name)

@@ -22,19 +22,23 @@ from tumortrack.core.cloud import thin_cloud
 from tumortrack.core.config import Config, check_seed, from_builtins, to_builtins
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import FAR_MM
+from tumortrack.core.evidence import Cut
 from tumortrack.core.process import parallel_map
 from tumortrack.core.types import Anatomy, DepthError
 from tumortrack.io.model_folder import SHAPE, organ_of, read_tensors
 from tumortrack.io.scene_folder import draw_targets
+from tumortrack.organ.body import BodyConfig
 from tumortrack.organ.rest_shape import RestShape, distances_of
 from tumortrack.registration.base_model import Model
 from tumortrack.registration.config import RegistrationConfig
+from tumortrack.registration.flap import cut_shape
 from tumortrack.registration.gauss_newton import RegistrationResult, refine
 from tumortrack.registration.in_distribution import InDistributionRange, fit_mm, spread_mm
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.multi_view import MultiViewCloud
 from tumortrack.registration.registration import Registration
 from tumortrack.registration.search import PosePrior
+from tumortrack.simulation.deform import links_of
 from tumortrack.simulation.scene import PoseConfig, SceneRecipe, Simulator, body_for
 
 _USUAL = 90  # per cent of the right fits cost no more than the usual cost
@@ -69,6 +73,13 @@ class RegistrationModel(Model):
         return Registration(
             self.shape, self.config.refine, pose_prior(self.config.scene.pose, up_lps)
         )
+
+    def with_cut(self, cuts: Sequence[Cut]) -> RegistrationModel:
+        """Of the organ with all that was cut of it. Raises as ``flap.cut_shape``."""
+        links = (link for each in self.config.scene.deform for link in links_of(each))
+        bodies = (getattr(link, "body", None) for link in links)
+        poisson = next(body.poisson for body in bodies if isinstance(body, BodyConfig))
+        return replace(self, shape=cut_shape(self.shape, cuts, poisson))
 
     def files(self) -> dict[str, bytes]:
         return {SHAPE: save(self.shape.to_arrays())}

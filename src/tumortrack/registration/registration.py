@@ -34,6 +34,7 @@ from tumortrack.core.process import parallel_map
 from tumortrack.organ.rest_shape import RestShape
 from tumortrack.registration.compliance import RefinedFit, refine_compliance
 from tumortrack.registration.config import GaussNewtonConfig
+from tumortrack.registration.flap import flap_starts
 from tumortrack.registration.gauss_newton import (
     FARTHEST,
     GaussNewton,
@@ -157,7 +158,8 @@ class Registration:
         new = [Start(motion) for motion in starts if far_from(motion, [fit.motion for fit in fits])]
         fits += self._fit_promising(views, new, fits)
         best = min(fits, key=lambda fit: cost_with_prior(fit, self.prior))
-        fits += self._fit_promising(views, turned_starts(best.motion, best.pose_offset), fits)
+        beside = [*turned_starts(best.motion, best.pose_offset), *flap_starts(best)]
+        fits += self._fit_promising(views, beside, fits)
         return select_best(fits, self.prior)
 
     def _fit_promising(

@@ -19,7 +19,7 @@ from tumortrack.core.cloud import CloudConfig
 from tumortrack.core.config import check_seed
 from tumortrack.core.errors import InputError, NotThisOrgan
 from tumortrack.core.estimate import Estimate, FollowOptions
-from tumortrack.core.evidence import CAMERA, FEWEST_TOUCHES, Evidence, touched
+from tumortrack.core.evidence import CAMERA, FEWEST_TOUCHES, Cut, Evidence, touched
 from tumortrack.core.geometry import IDENTITY, Affine, rigid, transform_points
 from tumortrack.core.process import tune_malloc
 from tumortrack.core.report import ProbeReport
@@ -28,6 +28,7 @@ from tumortrack.core.ultrasound import ProbeRecording
 from tumortrack.io.case import Case
 from tumortrack.registration.base_model import Model
 from tumortrack.registration.evidence import MOST_PLACES, EvidenceTerms
+from tumortrack.registration.flap import carried_to_ct
 from tumortrack.registration.locator import RegistrationLocator
 from tumortrack.registration.method import Locator, method_of_config
 from tumortrack.registration.model import RegistrationModel
@@ -66,12 +67,19 @@ class Tracker:
         self.model, self._locator = model, _locator(model)
         if advise and not isinstance(model, RegistrationModel):
             raise InputError("advice needs a model that knows a motion: give the case itself.")
-        self._advised = part_number(advise, model.parts) if advise else None
+        self._advise, self._advised = advise, part_number(advise, model.parts) if advise else None
 
     @property
     def anatomy_ct(self) -> Anatomy | None:
         """The organ in the CT (LPS, mm); None for models without correspondences."""
         return self._locator.anatomy_ct
+
+    def with_cut(self, cuts: Sequence[Cut]) -> Tracker:
+        """Of the organ with all that was cut of it: places of the CT (a second). Raises InputError:
+        they are none, or off the organ, or the model knows no motion."""
+        if not isinstance(self.model, RegistrationModel):
+            raise InputError("cuts need a model that knows a motion: give the case itself.")
+        return Tracker(self.model.with_cut(cuts), self._advise)
 
     def locate(
         self,
@@ -112,6 +120,17 @@ class Tracker:
         all_views: Sequence[View]
         all_views = _views_of(cloud, full_view, views)
         pieces, recordings = _evidence_of(evidence)
+        if cuts := tuple(each for each in pieces if isinstance(each, Cut)):
+            rest = (*(each for each in pieces if not isinstance(each, Cut)), *recordings)
+            known: dict[str, Any] = {
+                "views": views, "evidence": rest, "full_view": full_view, "seed": seed,
+                "grid": grid, "frame": frame,
+            }  # fmt: skip
+            if not all(cut.points_ct for cut in cuts):  # made just now, with the organ as it lies
+                motion = self.locate(cloud, **known).motion
+                assert isinstance(motion, ElasticMotion)
+                cuts = carried_to_ct(cuts, motion)
+            return self.with_cut(cuts).locate(cloud, **known)
         if frame == CAMERA:
             return self._located(cloud, all_views, pieces, grid, seed, recordings)
         if len(cloud.points_mm) or not (pieces or recordings):
@@ -323,7 +342,7 @@ def _evidence_of(
     evidence: Sequence[Evidence | ProbeRecording], recorded: bool = True
 ) -> tuple[tuple[Evidence, ...], tuple[ProbeRecording, ...]]:
     """``recorded``: recordings are allowed among it."""
-    kinds = "evidence is of Touch, Landmark, Grasp, Outline and FreeSpace"
+    kinds = "evidence is of Touch, Landmark, Grasp, Outline, FreeSpace and Cut"
     hint = "evidence=[Touch(place_mm=(x, y, z))]; further cameras' views are views=[...]"
     allowed = Evidence | ProbeRecording if recorded else Evidence
     every = _all_of(allowed, evidence, kinds, hint)
