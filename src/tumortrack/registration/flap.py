@@ -1,0 +1,267 @@
+"""An organ that is being cut: what an electrode has parted, and the flap that it leaves.
+
+A cut has three effects. The organ's surface gets walls (``_grooved``); cells that it crosses no
+longer hold (``_softened``); and what lies on the tumor's side of it, the flap, moves in a way that
+no state of the library knows. So six modes stand beside the library's: how the softened body
+follows three forces on the flap and three torques about its middle. Their prior is what a flap's
+loads do to it: a little, as long as it is held all round, and more the less holds it.
+
+Cuts that are moved with meshes: Paulus et al. 2015 (doi 10.1007/s11548-015-1192-4); reduced modes
+of soft joints are this project's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from tumortrack.case.surface import largest_shell
+from tumortrack.core.errors import InputError
+from tumortrack.core.evidence import Cut
+from tumortrack.core.types import Mesh
+from tumortrack.organ.body import ElasticBody
+from tumortrack.organ.finite import CONTRAST, BlockCholesky, ElementLattice, LatticeSolid
+from tumortrack.organ.modes import RigidMotions, compliance_modes, patches_of
+from tumortrack.organ.rest_shape import DistanceField, RestShape
+from tumortrack.registration.gauss_newton import RegistrationResult
+from tumortrack.registration.motion import ElasticMotion
+from tumortrack.registration.search import Start
+
+_MODES = 6
+_APART_MM = 1.5  # between places of a cut that are kept
+_NEIGHBOURS = 10  # of a place of the cut, through which its plane is laid
+# A cell is cut by at least this share of the places that a plane across it would hold: a corner
+# that a stray place touches does not count.
+_CROSSED = 0.12
+_CUT, _OPEN = 1e-3, 1e-4  # stiffness of cut cells, and of empty ones beside them, of what was there
+_STEP_MM, _RIM_MM = 1.0, 2.0  # of the field with the groove; how far round a kerf it changes
+_NEAR_STEPS = 1.5  # from the last place of a cut, in its places' distances, it ends
+# What a flap bears, mN, each axis: its weight or a cup's pull; and how stiff tissue is, kPa. Both
+# are presumed (kidneys have 5 to 30 kPa): they decide how much has to be cut before a flap moves.
+_LOAD_MN, _TISSUE_KPA = 500.0, 15.0
+_MOST_MM = 8.0  # of a flap's motion, one deviation, however little holds it
+_STARTED = 1.5  # deviations of a flap's shift, from which fits start
+
+
+def cut_shape(shape: RestShape, cuts: Sequence[Cut], poisson: float) -> RestShape:
+    """The organ with all that was cut of it, and of what ``shape`` is. ``cuts``: points of the CT;
+    ``poisson``: Poisson's ratio of its tissue. A second. Raises InputError: a cut has no points of
+    the CT, or all of them lie off the organ."""
+    shape = shape.intact or shape
+    if any(not cut.points_ct for cut in cuts):
+        raise InputError("a cut's places must be carried to the CT first, by where the organ was.")
+    points_ct = np.concatenate([np.array(cut.points_ct) for cut in cuts])
+    points_ct = _thinned(points_ct[shape.distances_mm(points_ct, 0) < _STEP_MM])
+    if not len(points_ct):
+        raise InputError("all that was cut lies off the organ: is it in the CT's frame (LPS, mm)?")
+    body, lattice = shape.body, _lattice_of(shape.body)
+    solid = LatticeSolid(shape.anatomy_ct, lattice, poisson)
+    crossed = _crossed(solid, points_ct)
+    factor = solid.factor_of(_softened(solid, crossed))
+    flaps = list(_flaps(shape, solid, crossed, points_ct))
+    modes, states = list[np.ndarray](), list[np.ndarray]()
+    for flap in flaps:
+        mine, covariance = _modes_of(solid, factor, flap)
+        modes.append(solid.spread(mine).astype(np.float32))
+        states.append(covariance)
+    kerf_mm = max(cut.kerf_mm for cut in cuts)
+    field = _grooved(shape.distances[0], points_ct, kerf_mm)
+    organ = _surface_of(field)
+    patches = patches_of(shape.anatomy_ct.organ, 600, np.random.default_rng(0))
+    assert body.compliance is not None
+    compliance = compliance_modes(solid, patches, body.compliance.shape[-1], factor)
+    new = replace(
+        body,
+        modes=np.concatenate([body.modes, *modes], axis=-1),
+        states=_with_uncorrelated(body.states, states),
+        compliance=solid.spread(compliance).astype(np.float32),
+    )
+    anatomy = replace(shape.anatomy_ct, parts=(organ, *shape.anatomy_ct.tumors))
+    distances = (field, *shape.distances[1:])
+    return RestShape(anatomy, new, distances, _MODES * len(flaps), shape)
+
+
+def carried_over(motion: ElasticMotion, shape: RestShape) -> ElasticMotion:
+    """A motion of the same organ, of which less or more was cut."""
+    coefficients = np.zeros(shape.body.modes.shape[-1])
+    count = min(len(coefficients), len(motion.coefficients))
+    coefficients[:count] = motion.coefficients[:count]
+    others = tuple((carried_over(other, shape), share) for other, share in motion.alternatives)
+    return replace(
+        motion, shape=shape, coefficients=coefficients, covariance=None, alternatives=others
+    )
+
+
+def flap_starts(fit: RegistrationResult) -> list[Start]:
+    """With each flap shifted both ways along each axis: where an instrument hides half of it, one
+    descent may end in another minimum."""
+    motion, body = fit.motion, fit.motion.shape.body
+    starts = list[Start]()
+    first = body.modes.shape[-1] - motion.shape.flap_modes
+    for flap in range(first, body.modes.shape[-1], _MODES):
+        shift = slice(flap, flap + 3)
+        squares, axes = np.linalg.eigh(body.covariance[shift, shift])
+        for way in (axes * np.sqrt(squares) * _STARTED).T:
+            for sign in (-1, 1):
+                coefficients = motion.coefficients.copy()
+                coefficients[shift] += sign * way
+                starts.append(Start(replace(motion, coefficients=coefficients), fit.pose_offset))
+    return starts
+
+
+def _lattice_of(body: ElasticBody) -> ElementLattice:
+    return ElementLattice(body.origin_mm.astype(float), body.spacing_mm, body.modes.shape[:3])
+
+
+def _thinned(points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "m 3"]:
+    """The mean of the points in each cube: an electrode passes most places often."""
+    cubes = np.floor(points / _APART_MM).astype(int)
+    _, cube, counts = np.unique(cubes, axis=0, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(cube.ravel(), axis) for axis in points.T], axis=1)
+    return np.asarray(sums / counts[:, None])
+
+
+def _crossed(solid: LatticeSolid, points_ct: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " c"]:
+    """Which cells are cut: by how densely places lie in them, against how densely they lie."""
+    h, lattice = solid.lattice.spacing_mm, solid.lattice
+    count = min(_NEIGHBOURS, len(points_ct))
+    reach = cKDTree(points_ct).query(points_ct, count)[0].reshape(len(points_ct), -1)[:, -1]
+    per_mm2 = count / (np.pi * np.maximum(reach, _APART_MM) ** 2)
+    place = np.floor((points_ct - lattice.origin_mm) / h).astype(int)
+    inside = ((place >= 0) & (place < lattice.cells)).all(1)
+    cell = np.ravel_multi_index(tuple(place[inside].T), lattice.cells)
+    size = int(np.prod(lattice.cells))
+    counts, density = np.bincount(cell, None, size), np.bincount(cell, per_mm2[inside], size)
+    needed = _CROSSED * h**2 * density / np.maximum(counts, 1)
+    mine = np.ravel_multi_index(tuple(solid.cells.T), lattice.cells)
+    return np.asarray((counts > 0) & (counts >= needed))[mine]
+
+
+def _softened(solid: LatticeSolid, crossed: Bool[np.ndarray, " c"]) -> Float64[np.ndarray, " c"]:
+    moduli = solid.moduli(CONTRAST)
+    cut = np.zeros(solid.lattice.cells, bool)
+    cut[tuple(solid.cells[crossed].T)] = True
+    beside = ndimage.binary_dilation(cut, np.ones((3, 3, 3)))[tuple(solid.cells.T)]
+    moduli[beside & (solid.organ == 0)] = _OPEN
+    moduli[crossed] *= _CUT
+    return moduli
+
+
+def _flaps(
+    shape: RestShape,
+    solid: LatticeSolid,
+    crossed: Bool[np.ndarray, " c"],
+    points_ct: Float64[np.ndarray, "n 3"],
+) -> Iterator[Bool[np.ndarray, " c"]]:
+    """Of each tumor that was cut round, the cells on its side of the cut: those that lie nearer to
+    it than the place of the cut that is nearest to them, and hang together with it."""
+    lattice = solid.lattice
+    middles = lattice.origin_mm + lattice.spacing_mm * (solid.cells + 0.5)
+    away = [np.maximum(shape.distances_mm(points_ct, n), 0) for n in range(1, len(shape.distances))]
+    if not away:
+        return
+    owner, tissue = np.argmin(away, axis=0), (solid.organ > 0) & ~crossed
+    for number, cut_mm in enumerate(away):
+        if not (owner == number).any():
+            continue
+        nearest = cKDTree(points_ct).query(middles)[1]
+        off_mm = np.maximum(shape.distances_mm(middles, number + 1), 0)
+        inside = tissue & (off_mm < cut_mm[nearest])
+        grid = np.zeros(lattice.cells, bool)
+        grid[tuple(solid.cells[inside].T)] = True
+        piece = ndimage.label(grid)[0][tuple(solid.cells.T)]
+        of_tumor = np.bincount(piece, solid.tumor * (off_mm < lattice.spacing_mm))
+        of_tumor[0] = 0
+        if of_tumor.max(initial=0) > 0:
+            yield piece == int(of_tumor.argmax())
+
+
+def _modes_of(
+    solid: LatticeSolid, factor: BlockCholesky, flap: Bool[np.ndarray, " c"]
+) -> tuple[Float64[np.ndarray, "f 6"], Float64[np.ndarray, "6 6"]]:
+    """Modes that move the flap's mean by 1 mm along an axis, or turn it by 1 mm at its radius of
+    gyration, and their coefficients' covariance."""
+    volume = np.repeat((solid.organ * flap)[:, None] / 8, 8, axis=1)
+    nodes = solid.unknowns[:, ::3] // 3
+    share = np.bincount(nodes.ravel(), volume.ravel(), len(solid.nodes))
+    share = share / share.sum()
+    arms = solid.nodes_mm - share @ solid.nodes_mm
+    radius_mm = float(np.sqrt(share @ (arms**2).sum(1) * 2 / 3))
+    turns = [np.cross(axis, arms) / radius_mm for axis in np.eye(3)]
+    moves = np.stack([*(np.tile(axis, (len(arms), 1)) for axis in np.eye(3)), *turns], axis=2)
+    moves = moves.reshape(-1, _MODES)  # of every node, as the flap moves rigidly
+    forces = moves * np.repeat(share, 3)[:, None]
+    rigid = RigidMotions.from_solid(solid)
+    responses = rigid.removed(factor.solve(rigid.balanced(forces)))
+    # What each does to the flap: its mean motion, least squares by volume.
+    yields = np.linalg.solve(forces.T @ moves, forces.T @ responses)
+    load = _LOAD_MN / _TISSUE_KPA
+    squares, axes = np.linalg.eigh(yields @ yields.T * load**2)
+    limited = squares * _MOST_MM**2 / (squares + _MOST_MM**2)
+    return responses @ np.linalg.inv(yields), (axes * limited) @ axes.T
+
+
+def _with_uncorrelated(
+    states: np.ndarray, covariances: Sequence[Float64[np.ndarray, "6 6"]]
+) -> np.ndarray:
+    """States with further coefficients, which have these covariances exactly, and none with each
+    other or those before."""
+    rng, every = np.random.default_rng(0), states.astype(float)
+    for covariance in covariances:
+        drawn = rng.normal(size=(len(every), len(covariance)))
+        known = np.column_stack([np.ones(len(every)), every])
+        drawn -= known @ np.linalg.lstsq(known, drawn, rcond=None)[0]
+        whitened = np.linalg.inv(np.linalg.cholesky(np.cov(drawn.T)))
+        every = np.column_stack([every, drawn @ (np.linalg.cholesky(covariance) @ whitened).T])
+    return every.astype(np.float32)
+
+
+def _grooved(
+    field: DistanceField, points_ct: Float64[np.ndarray, "n 3"], kerf_mm: float
+) -> DistanceField:
+    """The organ's distances with the kerf carved out: half of it about the planes through each
+    place's neighbours."""
+    step, values = min(field.spacing_mm, _STEP_MM), field.values_mm
+    for axis, count in enumerate(values.shape):
+        at = np.arange(0, count - 1 + 1e-6, step / field.spacing_mm)
+        low = np.minimum(at.astype(int), count - 2)
+        share = (at - low).reshape([-1 if a == axis else 1 for a in range(3)])
+        values = (1 - share) * values.take(low, axis) + share * values.take(low + 1, axis)
+    near = np.zeros(values.shape, bool)
+    places = np.rint((points_ct - field.origin_mm) / step).astype(int)
+    near[tuple(places[((places >= 0) & (places < values.shape)).all(1)].T)] = True
+    reach = int(np.ceil((kerf_mm / 2 + _RIM_MM) / step))
+    near = ndimage.binary_dilation(near, iterations=2 * reach)
+    nodes = np.argwhere(near) * step + field.origin_mm
+    count = min(_NEIGHBOURS, len(points_ct))
+    away, which = cKDTree(points_ct).query(nodes, count)
+    neighbours = points_ct[which.reshape(len(nodes), -1)]
+    middle = neighbours.mean(1)
+    spread = neighbours - middle[:, None]
+    normal = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1][:, :, 0]
+    off_mm = np.abs(((nodes - middle) * normal).sum(1))
+    beside_mm = np.sqrt(np.maximum(away.reshape(len(nodes), -1)[:, 0] ** 2 - off_mm**2, 0))
+    apart_mm = np.median(np.linalg.norm(spread, axis=2), axis=1)
+    carved = np.where(beside_mm < _NEAR_STEPS * apart_mm, kerf_mm / 2 - off_mm, -np.inf)
+    values[near] = np.maximum(values[near], carved)
+    return DistanceField(values.astype(np.float32), field.origin_mm, step)
+
+
+def _surface_of(field: DistanceField) -> Mesh:
+    from skimage import measure
+
+    vertices, faces, _, _ = measure.marching_cubes(field.values_mm, 0.0)
+    return largest_shell(Mesh(vertices * field.spacing_mm + field.origin_mm, faces))
+
+
+def carried_to_ct(cuts: Sequence[Cut], motion: ElasticMotion) -> tuple[Cut, ...]:
+    """Cuts as places of the CT; ``motion``: where the organ lay when those before the camera were
+    made."""
+    return tuple(
+        cut if cut.points_ct else cut.of_ct(motion.inverse(np.array(cut.places_mm))) for cut in cuts
+    )
