@@ -323,6 +323,15 @@ class MotionReport(_Value, frozen=True, kw_only=True):
     depth_share: float = 0.0  # not stated by runs of before
 
 
+class CutReport(_Value, frozen=True, kw_only=True):
+    """What an answer knows of cuts: at how many places (one in each cube of 1.5 mm), how wide they
+    are, and which tumors have a flap."""
+
+    places: int
+    kerf_mm: float
+    flaps: tuple[str, ...]
+
+
 class ScanReport(_Value, frozen=True, kw_only=True):
     """How far off the least sure tumor is at most (95 %) with one view, two, ...; without one, the
     organ."""
@@ -358,6 +367,7 @@ class FitReport(_Value, frozen=True, kw_only=True, omit_defaults=True):
     views: ViewsReport | None = None
     evidence: tuple[EvidenceReport, ...] = ()
     probes: tuple[ProbeReport, ...] = ()
+    cut: CutReport | None = None
     fit_mm: Residuals | None = None
     timings: dict[str, float] = {}
     unseen: float | None = None

@@ -34,6 +34,7 @@ _BODY, _STRUCTURE, _VERTICES = "body.", "structure.", "vertices_mm"
 _ERROR_MM, _LENGTH_MM = 0.5, 20.0
 _APART = 0.85  # lengths between neighbouring nodes, at most
 _MOST_NODES = 256  # of a large organ: they then lie farther apart
+FLAP_MODES = 6
 _RIDGE = 1e-3  # of the variance: keeps the correlations invertible
 
 
@@ -125,14 +126,29 @@ def error_covariance_mm2(points_ct: Float[np.ndarray, "n 3"]) -> Float64[np.ndar
 
 
 @dataclass(frozen=True, eq=False)
+class CutOrgan:
+    """What was cut (``registration.flap``): places of it in the CT, mm, and how wide; the names of
+    the tumors with a flap; the organ before."""
+
+    points_ct: Float64[np.ndarray, "n 3"]
+    kerf_mm: float
+    flaps: tuple[str, ...]
+    intact: RestShape
+
+
+@dataclass(frozen=True, eq=False)
 class RestShape:
     """The organ at rest (CT frame, LPS mm): ``distances`` has one field per part."""
 
     anatomy_ct: Anatomy
     body: ElasticBody
     distances: tuple[DistanceField, ...]
-    flap_modes: int = 0  # of the body's, the last ones: see ``registration.flap``
-    intact: RestShape | None = None  # before it was cut
+    cut: CutOrgan | None = None
+
+    @property
+    def flap_modes(self) -> int:
+        """How many of the body's modes, the last ones, are flaps'."""
+        return 0 if self.cut is None else FLAP_MODES * len(self.cut.flaps)
 
     @cached_property
     def compliant(self) -> RestShape:

@@ -23,16 +23,16 @@ from scipy.spatial import cKDTree
 from tumortrack.case.surface import largest_shell
 from tumortrack.core.errors import InputError
 from tumortrack.core.evidence import Cut
+from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Mesh
 from tumortrack.organ.body import ElasticBody
 from tumortrack.organ.finite import CONTRAST, BlockCholesky, ElementLattice, LatticeSolid
 from tumortrack.organ.modes import RigidMotions, compliance_modes, patches_of
-from tumortrack.organ.rest_shape import DistanceField, RestShape
+from tumortrack.organ.rest_shape import FLAP_MODES, CutOrgan, DistanceField, RestShape
 from tumortrack.registration.gauss_newton import RegistrationResult
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.search import Start
 
-_MODES = 6
 _APART_MM = 1.5  # between places of a cut that are kept
 _NEIGHBOURS = 10  # of a place of the cut, through which its plane is laid
 # A cell is cut by at least this share of the places that a plane across it would hold: a corner
@@ -52,7 +52,7 @@ def cut_shape(shape: RestShape, cuts: Sequence[Cut], poisson: float) -> RestShap
     """The organ with all that was cut of it, and of what ``shape`` is. ``cuts``: points of the CT;
     ``poisson``: Poisson's ratio of its tissue. A second. Raises InputError: a cut has no points of
     the CT, or all of them lie off the organ."""
-    shape = shape.intact or shape
+    shape = shape if shape.cut is None else shape.cut.intact
     if any(not cut.points_ct for cut in cuts):
         raise InputError("a cut's places must be carried to the CT first, by where the organ was.")
     points_ct = np.concatenate([np.array(cut.points_ct) for cut in cuts])
@@ -63,15 +63,15 @@ def cut_shape(shape: RestShape, cuts: Sequence[Cut], poisson: float) -> RestShap
     solid = LatticeSolid(shape.anatomy_ct, lattice, poisson)
     crossed = _crossed(solid, points_ct)
     factor = solid.factor_of(_softened(solid, crossed))
-    flaps = list(_flaps(shape, solid, crossed, points_ct))
+    flaps = dict(_flaps(shape, solid, crossed, points_ct))
     modes, states = list[np.ndarray](), list[np.ndarray]()
-    for flap in flaps:
+    for flap in flaps.values():
         mine, covariance = _modes_of(solid, factor, flap)
         modes.append(solid.spread(mine).astype(np.float32))
         states.append(covariance)
     kerf_mm = max(cut.kerf_mm for cut in cuts)
-    field = _grooved(shape.distances[0], points_ct, kerf_mm)
-    organ = _surface_of(field)
+    kerf = _kerf(shape.distances[0], points_ct, kerf_mm)
+    field, organ = _grooved(shape.distances[0], kerf), _without(shape.anatomy_ct.organ, kerf)
     patches = patches_of(shape.anatomy_ct.organ, 600, np.random.default_rng(0))
     assert body.compliance is not None
     compliance = compliance_modes(solid, patches, body.compliance.shape[-1], factor)
@@ -83,7 +83,7 @@ def cut_shape(shape: RestShape, cuts: Sequence[Cut], poisson: float) -> RestShap
     )
     anatomy = replace(shape.anatomy_ct, parts=(organ, *shape.anatomy_ct.tumors))
     distances = (field, *shape.distances[1:])
-    return RestShape(anatomy, new, distances, _MODES * len(flaps), shape)
+    return RestShape(anatomy, new, distances, CutOrgan(points_ct, kerf_mm, tuple(flaps), shape))
 
 
 def carried_over(motion: ElasticMotion, shape: RestShape) -> ElasticMotion:
@@ -103,7 +103,7 @@ def flap_starts(fit: RegistrationResult) -> list[Start]:
     motion, body = fit.motion, fit.motion.shape.body
     starts = list[Start]()
     first = body.modes.shape[-1] - motion.shape.flap_modes
-    for flap in range(first, body.modes.shape[-1], _MODES):
+    for flap in range(first, body.modes.shape[-1], FLAP_MODES):
         shift = slice(flap, flap + 3)
         squares, axes = np.linalg.eigh(body.covariance[shift, shift])
         for way in (axes * np.sqrt(squares) * _STARTED).T:
@@ -157,28 +157,27 @@ def _flaps(
     solid: LatticeSolid,
     crossed: Bool[np.ndarray, " c"],
     points_ct: Float64[np.ndarray, "n 3"],
-) -> Iterator[Bool[np.ndarray, " c"]]:
-    """Of each tumor that was cut round, the cells on its side of the cut: those that lie nearer to
-    it than the place of the cut that is nearest to them, and hang together with it."""
+) -> Iterator[tuple[str, Bool[np.ndarray, " c"]]]:
+    """Of each tumor that was cut round, its name and the cells on its side of the cut: those that
+    lie nearer to it than the place of the cut that is nearest to them, and hang together with
+    it."""
     lattice = solid.lattice
-    middles = lattice.origin_mm + lattice.spacing_mm * (solid.cells + 0.5)
-    away = [np.maximum(shape.distances_mm(points_ct, n), 0) for n in range(1, len(shape.distances))]
-    if not away:
-        return
-    owner, tissue = np.argmin(away, axis=0), (solid.organ > 0) & ~crossed
-    for number, cut_mm in enumerate(away):
-        if not (owner == number).any():
-            continue
-        nearest = cKDTree(points_ct).query(middles)[1]
-        off_mm = np.maximum(shape.distances_mm(middles, number + 1), 0)
-        inside = tissue & (off_mm < cut_mm[nearest])
+    middles = np.ascontiguousarray(lattice.origin_mm + lattice.spacing_mm * (solid.cells + 0.5))
+    nearest = cKDTree(points_ct).query(middles)[1]
+    tumors = shape.anatomy_ct.tumors
+    away_mm = [cKDTree(part.vertices_mm).query(points_ct)[0] for part in tumors]
+    owner = np.argmin(away_mm, axis=0) if tumors else np.zeros(0, int)
+    for number in np.unique(owner):
+        off_mm = cKDTree(tumors[number].vertices_mm).query(middles)[0]
+        off_mm[shape.distances_mm(middles, number + 1) < 0] = 0.0
+        inside = (solid.organ > 0) & ~crossed & (off_mm < away_mm[number][nearest])
         grid = np.zeros(lattice.cells, bool)
         grid[tuple(solid.cells[inside].T)] = True
         piece = ndimage.label(grid)[0][tuple(solid.cells.T)]
-        of_tumor = np.bincount(piece, solid.tumor * (off_mm < lattice.spacing_mm))
-        of_tumor[0] = 0
-        if of_tumor.max(initial=0) > 0:
-            yield piece == int(of_tumor.argmax())
+        sizes = np.bincount(piece, off_mm < lattice.spacing_mm)  # of what is the tumor's
+        sizes[0] = 0
+        if sizes.max() > 0:
+            yield shape.anatomy_ct.names[number + 1], piece == int(sizes.argmax())
 
 
 def _modes_of(
@@ -194,7 +193,7 @@ def _modes_of(
     radius_mm = float(np.sqrt(share @ (arms**2).sum(1) * 2 / 3))
     turns = [np.cross(axis, arms) / radius_mm for axis in np.eye(3)]
     moves = np.stack([*(np.tile(axis, (len(arms), 1)) for axis in np.eye(3)), *turns], axis=2)
-    moves = moves.reshape(-1, _MODES)  # of every node, as the flap moves rigidly
+    moves = moves.reshape(-1, FLAP_MODES)  # of every node, as the flap moves rigidly
     forces = moves * np.repeat(share, 3)[:, None]
     rigid = RigidMotions.from_solid(solid)
     responses = rigid.removed(factor.solve(rigid.balanced(forces)))
@@ -221,25 +220,30 @@ def _with_uncorrelated(
     return every.astype(np.float32)
 
 
-def _grooved(
+def _grooved(field: DistanceField, kerf: DistanceField) -> DistanceField:
+    """The organ's distances with the kerf carved out, on the kerf's lattice."""
+    values = field.values_mm
+    for axis, (count, wanted) in enumerate(zip(values.shape, kerf.values_mm.shape, strict=True)):
+        at = np.arange(wanted) * kerf.spacing_mm / field.spacing_mm
+        low = np.minimum(at.astype(int), count - 2)
+        share = np.float32(at - low).reshape([-1 if a == axis else 1 for a in range(3)])
+        values = (1 - share) * values.take(low, axis) + share * values.take(low + 1, axis)
+    return kerf._replace(values_mm=np.maximum(values, -kerf.values_mm).astype(np.float32))
+
+
+def _kerf(
     field: DistanceField, points_ct: Float64[np.ndarray, "n 3"], kerf_mm: float
 ) -> DistanceField:
-    """The organ's distances with the kerf carved out: half of it about the planes through each
-    place's neighbours."""
-    step, values = min(field.spacing_mm, _STEP_MM), field.values_mm
-    for axis, count in enumerate(values.shape):
-        at = np.arange(0, count - 1 + 1e-6, step / field.spacing_mm)
-        low = np.minimum(at.astype(int), count - 2)
-        share = (at - low).reshape([-1 if a == axis else 1 for a in range(3)])
-        values = (1 - share) * values.take(low, axis) + share * values.take(low + 1, axis)
-    near = np.zeros(values.shape, bool)
+    """Distances to where an electrode was, negative inside, no larger than 1 mm: half a kerf to
+    either side of the planes through neighbouring places. On a lattice where the organ's is."""
+    step = min(field.spacing_mm, _STEP_MM)
+    shape = [int((count - 1) * field.spacing_mm / step) + 1 for count in field.values_mm.shape]
+    near = np.zeros(shape, bool)
     places = np.rint((points_ct - field.origin_mm) / step).astype(int)
-    near[tuple(places[((places >= 0) & (places < values.shape)).all(1)].T)] = True
-    reach = int(np.ceil((kerf_mm / 2 + _RIM_MM) / step))
-    near = ndimage.binary_dilation(near, iterations=2 * reach)
+    near[tuple(places[((places >= 0) & (places < shape)).all(1)].T)] = True
+    near = ndimage.binary_dilation(near, iterations=int(np.ceil((kerf_mm + _RIM_MM) / step)))
     nodes = np.argwhere(near) * step + field.origin_mm
-    count = min(_NEIGHBOURS, len(points_ct))
-    away, which = cKDTree(points_ct).query(nodes, count)
+    away, which = cKDTree(points_ct).query(nodes, min(_NEIGHBOURS, len(points_ct)))
     neighbours = points_ct[which.reshape(len(nodes), -1)]
     middle = neighbours.mean(1)
     spread = neighbours - middle[:, None]
@@ -247,16 +251,20 @@ def _grooved(
     off_mm = np.abs(((nodes - middle) * normal).sum(1))
     beside_mm = np.sqrt(np.maximum(away.reshape(len(nodes), -1)[:, 0] ** 2 - off_mm**2, 0))
     apart_mm = np.median(np.linalg.norm(spread, axis=2), axis=1)
-    carved = np.where(beside_mm < _NEAR_STEPS * apart_mm, kerf_mm / 2 - off_mm, -np.inf)
-    values[near] = np.maximum(values[near], carved)
-    return DistanceField(values.astype(np.float32), field.origin_mm, step)
+    values = np.ones(shape, np.float32)
+    inside = beside_mm < _NEAR_STEPS * apart_mm
+    values[near] = np.where(inside, np.minimum(off_mm - kerf_mm / 2, 1.0), 1.0)
+    return DistanceField(values, field.origin_mm, step)
 
 
-def _surface_of(field: DistanceField) -> Mesh:
+def _without(organ: Mesh, kerf: DistanceField) -> Mesh:
+    """The organ's surface, with the walls of a kerf."""
     from skimage import measure
 
-    vertices, faces, _, _ = measure.marching_cubes(field.values_mm, 0.0)
-    return largest_shell(Mesh(vertices * field.spacing_mm + field.origin_mm, faces))
+    values = np.pad(kerf.values_mm, 1, constant_values=1.0)
+    vertices, faces, _, _ = measure.marching_cubes(values, 0.0)
+    cut = Mesh((vertices - 1) * kerf.spacing_mm + kerf.origin_mm, faces)
+    return largest_shell(mesh_of(solid_of(organ, "the organ") - solid_of(cut, "the kerf")))
 
 
 def carried_to_ct(cuts: Sequence[Cut], motion: ElasticMotion) -> tuple[Cut, ...]:

@@ -172,8 +172,9 @@ class ElasticMotion(Renamed):
         return np.concatenate([*columns, along[:, :, None]], axis=2)
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """All of a fitted motion but its shape. ``places``: a row of it and of each alternative
-        (that may have fewer coefficients): share, rotation, centre, coefficients."""
+        """All of a fitted motion but its shape, of which it has what was cut. ``places``: a row of
+        it and of each alternative (that may have fewer coefficients): share, rotation, centre,
+        coefficients."""
         assert self.covariance is not None
         every = (self, 1.0), *self.alternatives
         rows = np.zeros((len(every), 13 + len(self.coefficients)))
@@ -181,7 +182,9 @@ class ElasticMotion(Renamed):
             known = share, *motion.rotation.flat, *motion.centre_mm, *motion.coefficients
             row[: len(known)] = known
         scales = np.array([self.depth_share, self.std_scale])
-        return {"places": rows, "covariance": self.covariance, "scales": scales}
+        cut = self.shape.cut
+        more = {} if cut is None else {"cut_ct": cut.points_ct, "kerf_mm": np.array(cut.kerf_mm)}
+        return {"places": rows, "covariance": self.covariance, "scales": scales, **more}
 
     @classmethod
     def from_arrays(cls, shape: RestShape, arrays: dict[str, np.ndarray]) -> ElasticMotion:

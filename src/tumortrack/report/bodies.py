@@ -15,6 +15,7 @@ import tumortrack
 from tumortrack.core import store
 from tumortrack.core.colours import name_colour, structure_colour
 from tumortrack.core.errors import InputError
+from tumortrack.core.evidence import Cut
 from tumortrack.core.mesh_query import contains
 from tumortrack.core.types import ORGAN, Anatomy
 from tumortrack.io.body_files import Cells, write_usd, write_vtk
@@ -121,6 +122,9 @@ def _located(run: Path, case: Case, folder: Path) -> tuple[dict[str, Any], Elast
         raise InputError(f"{run} lacks {MOTION}, which older versions did not write: locate again.")
     model, arrays = load_model(kept), read_tensors(run / MOTION, load)
     assert isinstance(model, RegistrationModel)  # others' reports have no motion
+    if "cut_ct" in arrays:
+        cut, kerf_mm = np.atleast_2d(arrays["cut_ct"]), float(arrays["kerf_mm"])
+        model = model.with_cut([Cut(points_ct=tuple(map(tuple, cut.tolist())), kerf_mm=kerf_mm)])
     return report, ElasticMotion.from_arrays(model.shape.compliant, arrays)
 
 
