@@ -32,7 +32,7 @@ from tumortrack.core.report import (
     NextEvidence,
     ViewsReport,
 )
-from tumortrack.core.types import View
+from tumortrack.core.types import Anatomy, View
 from tumortrack.io.model_folder import reliability_warning
 from tumortrack.registration.base_model import Model
 from tumortrack.registration.in_distribution import FIT_FACTOR, RIVAL_COST
@@ -299,6 +299,16 @@ class Disputes:
     def acknowledge(self) -> None:
         """The user has seen them all."""
         self._open = []
+
+    def carry_over(self, before: Anatomy | None, now: Anatomy | None) -> None:
+        """The organ has another surface from now on, as more was cut of it."""
+        if before is None or now is None:
+            return
+        for dispute in self._open:
+            was, is_now = (each.closed.get(dispute.part, each.organ) for each in (before, now))
+            there_ct = was.vertices_mm[dispute.vertex]
+            away_mm = np.linalg.norm(is_now.vertices_mm - there_ct, axis=1)
+            dispute.vertex = int(away_mm.argmin())
 
     def update(self, estimate: Estimate) -> Finding | None:
         """With the next answer: what still speaks against it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -166,6 +167,20 @@ def plane_section(
     crosses = (start_height > 0) != (end_height > 0)  # two edges of each triangle
     share = start_height[crosses] / (start_height - end_height)[crosses]
     return (start[crosses] + share[:, None] * (end - start)[crosses]).reshape(-1, 2, 3)
+
+
+def swept_places(ends_mm: Float[np.ndarray, "n 2 3"], step_mm: float) -> Float[np.ndarray, "m 3"]:
+    """Places, at most ``step_mm`` apart, on what a straight line sweeps whose two ends go from each
+    pose to the next one; of a single pose, on the line."""
+    length_mm = np.linalg.norm(ends_mm[:, 1] - ends_mm[:, 0], axis=1).max()
+    along = np.linspace(0, 1, int(np.ceil(length_mm / step_mm)) + 1)[:, None]
+    lines = ends_mm[:, :1] + along * (ends_mm[:, 1:] - ends_mm[:, :1])  # (n, k, 3)
+    swept = [lines[:1]]
+    for before, after in pairwise(lines):
+        steps = int(np.ceil(np.linalg.norm(after - before, axis=1).max() / step_mm))
+        shares = np.arange(1, steps + 1)[:, None, None] / max(steps, 1)
+        swept.append(before + shares * (after - before))
+    return np.concatenate(swept).reshape(-1, 3)
 
 
 def std_of(covariance: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:

@@ -189,6 +189,7 @@ class Loop:
     def _shown(self, seen: Observation, source: Cameras) -> tuple[TrackingResult, float]:
         """The result of a frame, and of what time it is, by ``time.monotonic``."""
         live_clock = source.latency_from != "taking"
+        self._follower.cuts.beside = live_clock
         # A frame that is made on demand waits for this computer alone, however slow that is.
         stale_s = math.inf if source.on_demand else self._config.stale_s
         result = self._answer(seen, source.capture_ns(seen), live_clock, stale_s)

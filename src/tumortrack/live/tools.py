@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.evidence import Evidence
+from tumortrack.core.evidence import Cut, Evidence
 from tumortrack.live.values import CameraView, SinkContext
 
 if TYPE_CHECKING:
@@ -91,8 +91,9 @@ class Tools:
 
     def located(self, view: CameraView, estimate: Estimate) -> None:
         """The estimate of that view."""
-        told = estimate.report.evidence[-len(self._given) :] if self._given else ()
-        for piece, said in zip(self._given, told, strict=False):
+        given = [piece for piece in self._given if not isinstance(piece, Cut)]  # those it tells of
+        told = estimate.report.evidence[-len(given) :] if given else ()
+        for piece, said in zip(given, told, strict=False):
             if said.rejected and piece.tool in self._tools:
                 self._tools[piece.tool].counts["rejected"] += 1
         for name, tool in self._tools.items():

@@ -299,11 +299,14 @@ class TrackingResult(Renamed):
 
     @property
     def extra_status(self) -> str:
-        """``cameras``, and how much evidence is in use or was left out, in words."""
+        """``cameras``, how much evidence is in use or was left out, and at how many places it was
+        cut, in words."""
         told = () if self.estimate is None else self.estimate.report.evidence
         out = sum(piece.rejected for piece in told)
         words = f"evidence: {len(told) - out} in use, {out} left out" if told else ""
-        return "; ".join(filter(None, (self.cameras, words)))
+        cut = None if self.estimate is None else self.estimate.report.cut
+        known = "" if cut is None else f"cut: {cut.known} places, {cut.places} in use"
+        return "; ".join(filter(None, (self.cameras, words, known)))
 
     def describe(self) -> str:
         """How good the estimate is, in words, or why there is none."""
@@ -350,8 +353,9 @@ class Controls:
     ``clicks``: colours at clicks in pictures; ``tissue_classifier``: the classifier learned from
     them, if they can be separated; ``colour``: its state in words. ``touched``: names of tools of
     which the user says that they touch now, or take, or let go. ``acknowledged``: evidence that
-    contradicts was wrong. ``forgotten``: by ``forget``, also the last estimate and all evidence:
-    the organ is searched for again."""
+    contradicts was wrong, and what was said to be cut without a place was not cut. ``cut``: it is
+    being cut, and nothing is known of where. ``forgotten``: by ``forget``, also the last estimate
+    and all evidence but cuts: the organ is searched for again."""
 
     picked_mm: Float64[np.ndarray, " 3"] | None = None
     aborted: threading.Event = field(default_factory=threading.Event)
@@ -360,6 +364,7 @@ class Controls:
     colour: str = ""
     touched: deque[str] = field(default_factory=deque)
     acknowledged: threading.Event = field(default_factory=threading.Event)
+    cut: threading.Event = field(default_factory=threading.Event)
     forgotten: threading.Event = field(default_factory=threading.Event)
 
     def click(self, seen: Observation, place_mm: Float[np.ndarray, " 3"], organ: bool) -> None:

@@ -183,6 +183,9 @@ class ViewsLocator:
             return estimate
         way = self._camera_from_last(lead)
         self.evidence = (*evidence, *self.tools.evidence(lead))
+        if self._context.controls.cut.is_set():  # also by tools
+            self._context.controls.cut.clear()
+            self._follower.cuts.tell()
         estimate = self._follower.locate(
             organ,
             lead.seen.content,
@@ -227,6 +230,7 @@ class ViewsLocator:
         if controls.acknowledged.is_set():
             controls.acknowledged.clear()
             self._follower.disputes.acknowledge()
+            self._follower.cuts.deny()
         if controls.forgotten.is_set():
             controls.forgotten.clear()
             self._follower.forget()

@@ -191,8 +191,7 @@ class RestShape:
 
     def distances_mm(self, points_ct: Float64[np.ndarray, "n 3"], surface: int) -> np.ndarray:
         """Of points to a surface (see ``field``), negative inside; right near it."""
-        points = np.ascontiguousarray(points_ct, np.float32)
-        inside = np.zeros(len(points), np.uint8)
+        points, inside = points_ct.astype(np.float32), np.zeros(len(points_ct), np.uint8)
         away_mm = np.full(len(points), np.finfo(np.float32).max, np.float32)
         _mark(self.field(surface), 1, points, inside, away_mm)
         return np.where(inside, -away_mm, away_mm).astype(float)

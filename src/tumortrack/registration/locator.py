@@ -204,9 +204,11 @@ class RegistrationLocator:
     def _smoothed(
         self, refined: RefinedFit, last: Estimate | None, stamp_ns: int, smoothing_s: float
     ) -> tuple[RefinedFit, float]:
-        """With the mean over past motions, and by how many seconds that lags behind what moves
-        steadily; a mean that lies too far behind is left out."""
+        """With the mean over past motions of the same body, and by how many seconds that lags
+        behind what moves steadily; a mean that lies too far behind is left out."""
         if last is None or not isinstance(last.motion, ElasticMotion) or smoothing_s <= 0:
+            return refined, 0.0
+        if last.motion.shape is not refined.motion.shape:  # it was cut in between
             return refined, 0.0
         past_s = (stamp_ns - last.cloud.stamp_ns) * 1e-9
         share = -math.expm1(-past_s / smoothing_s)

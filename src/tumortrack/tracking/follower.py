@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,10 @@ from tumortrack.core.evidence import Evidence
 from tumortrack.core.geometry import IDENTITY, Affine, transform_points
 from tumortrack.core.report import Likely
 from tumortrack.core.types import DepthFrame, SensorCloud, View
+from tumortrack.registration.flap import carried_over
+from tumortrack.registration.model import RegistrationModel
+from tumortrack.registration.motion import ElasticMotion
+from tumortrack.tracking.cuts import Cuts
 from tumortrack.tracking.tracker import Tracker, seen_from
 
 # For so long after a good estimate the organ is also searched for upside down. In first views, that
@@ -60,14 +65,14 @@ class Follower:
         self._scanned_ns, self._at_rest = 0, False
         self._known, self._known_ns = tuple[Any, ...](), 0  # evidence of the last estimate
         self._good_ns: int | None = None
-        self.disputes = Disputes()
+        self.disputes, self.cuts = Disputes(), Cuts(tracker)
         self._causes_ns, self._causes = 0, dict[str, tuple[Likely, ...]]()
 
     def warm(self) -> None:
         self._tracker.warm()
 
     def forget(self) -> None:
-        """Drop the last estimate and all evidence: after a new clock, or a new pick."""
+        """Drop the last estimate and all evidence but cuts: after a new clock, or a new pick."""
         self._last, self._known = None, ()
 
     def lose(self) -> None:
@@ -103,8 +108,13 @@ class Follower:
         """The estimate of this frame. ``views``: of further cameras; ``evidence``: what became
         known with it, beside what was known before; ``camera_from_last``: as in ``last_box_mm``.
         Raises NoEstimate, as ``Tracker.follow``; the last estimate is then dropped, but not the
-        evidence."""
+        evidence. Cuts among it are known to the end, see ``cuts``."""
+        if (tracker := self.cuts.tracker()) is not None:
+            self.disputes.carry_over(self._tracker.anatomy_ct, tracker.anatomy_ct)
+            self._tracker = tracker
+        evidence = self.cuts.take(evidence, cloud.stamp_ns, camera_from_last)
         last, self._last, self._at_rest = self._recent(cloud.stamp_ns), None, False
+        last = last and self._of_this_body(last)
         if last is not None and camera_from_last is not IDENTITY:
             last = seen_from(last, camera_from_last)
         earlier = () if last is not None else self._earlier(cloud.stamp_ns, camera_from_last)
@@ -129,21 +139,32 @@ class Follower:
         except NoEstimate as error:
             if error.causes:
                 self._causes = {**self._causes, "none": error.causes}
+            self.cuts.settle(cloud.stamp_ns)
             raise
+        self.cuts.settle(cloud.stamp_ns, self._last, camera_from_last)
         self._known, self._known_ns = self._last.evidence, cloud.stamp_ns
         if causes := self._last.causes:
             self._causes = {**self._causes, check_of(self._last): causes}
         if self._last.quality == "good":
             self._good_ns = cloud.stamp_ns
-        return self._disputed(self._last)
+        return self._disputed(self.cuts.reported(self._last))
 
     def _disputed(self, estimate: Estimate) -> Estimate:
-        """Poor, while evidence that contradicted one before is not acknowledged; the next frame is
-        followed as if it were not."""
-        finding = self.disputes.update(estimate)
+        """Poor, while evidence that contradicted one before is not acknowledged, or too little is
+        known of what was cut; the next frame is followed as if it were not."""
+        finding = self.disputes.update(estimate) or self.cuts.finding
         if finding is None or estimate.finding is not None:
             return estimate
         return estimate.assessed(finding=finding)
+
+    def _of_this_body(self, last: Estimate) -> Estimate:
+        """Of an organ of which less was cut then."""
+        model, start = self._tracker.model, last.unsmoothed
+        if not isinstance(model, RegistrationModel) or not isinstance(start, ElasticMotion):
+            return last
+        if start.shape is model.shape:
+            return last
+        return replace(last, unsmoothed=carried_over(start, model.shape))
 
     def _earlier(self, stamp_ns: int, camera_from_last: Affine) -> tuple[Any, ...]:
         """Evidence of before the organ was lost."""

@@ -17,8 +17,8 @@ from jaxtyping import Float64
 
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.evidence import Evidence, FreeSpace, Grasp, Landmark, Touch
-from tumortrack.core.geometry import Affine, Points, transform_points, unit
+from tumortrack.core.evidence import Cut, Evidence, FreeSpace, Grasp, Landmark, Touch
+from tumortrack.core.geometry import Affine, Points, swept_places, transform_points, unit
 from tumortrack.core.report import Point
 from tumortrack.live.tools import Tool, ToolConfig
 from tumortrack.live.values import CameraView, SinkContext
@@ -29,6 +29,8 @@ _LATE_NS = (0, 25_000_000, 50_000_000)  # a pose so long before a frame stands f
 _KEPT_NS = 1_000_000_000  # a touch waits so long for a frame in which the organ is found
 _SWEEP_MM = 3.0  # between two touches of a sweep
 _SHAFT_MM = 5.0  # between places along a shaft
+_CUT_MM = 1.5  # between places of a cut: as finely as a tracker keeps them
+_CUT_AT_ONCE, _LONGEST_CUT_NS = 25, 10_000_000_000  # poses in one piece; before a frame: hidden
 _GRASP_MM = 10.0  # from the tip to the next vertex of the organ: jaws are that long
 _REACH_MM = 2000.0  # of a point of the CT
 _LARGEST_STD_MM = 50.0  # of evidence
@@ -49,6 +51,9 @@ class TipConfig(ToolConfig, frozen=True, kw_only=True):
         point: of the CT (LPS, mm), which it touches: a landmark.
         shaft_mm: length of its shaft, where no tissue is: from the tip towards the tool's origin,
             or, where that is the tip, along -z. 0: unknown.
+        electrode_mm: length of its bare electrode, from the tip likewise: while it is energised
+            (its contact says so), all of that cuts. 0: it does not cut.
+        kerf_mm: width of the gap that it leaves.
     """
 
     tip: Point = (0.0, 0.0, 0.0)
@@ -59,16 +64,20 @@ class TipConfig(ToolConfig, frozen=True, kw_only=True):
     sweep: bool = False
     point: Point | None = None
     shaft_mm: float = 0.0
+    electrode_mm: float = 0.0
+    kerf_mm: float = 1.5
 
     def __post_init__(self) -> None:
         what = f"{self.__struct_config__.tag}:"
         self.check_between(what, tip=(-1000, 1000), tip_mm=(0, 50), std_mm=(0.05, 50))
         if self.shaft_mm:
-            self.check_between(what, shaft_mm=(_SHAFT_MM, 500))
+            self.check_between(what, shaft_mm=(self.electrode_mm + _SHAFT_MM, 500))
         if self.point is not None:
             self.check_between(what, point=(-_REACH_MM, _REACH_MM))
-        if self.holds + self.sweep + (self.point is not None) > 1:
-            raise InputError(f"{what} holds, sweep and point exclude each other.")
+        self.check_between(what, electrode_mm=(0, 200), kerf_mm=(0.1, 20))
+        cuts = self.electrode_mm > 0
+        if self.holds + self.sweep + cuts + (self.point is not None) > 1:
+            raise InputError(f"{what} holds, sweep, point and electrode_mm exclude each other.")
 
 
 class Piece(NamedTuple):
@@ -93,6 +102,7 @@ class TipTool(Tool):
     ) -> None:
         super().__init__()
         self.config, self.context, self.name = config, context, name
+        self._bare_mm = config.electrode_mm
         if config.part and config.part not in context.touchable:
             parts = ", ".join(context.touchable)
             raise InputError(f"there is no part {config.part!r}; this organ has {parts}.")
@@ -107,6 +117,8 @@ class TipTool(Tool):
         self._clicks, self._fault = 0, ""  # of which the next frame tells
         self._point: dict[str, Any] | None = None  # of the CT, that it holds
         self._waiting: list[tuple[int, Piece]] = []  # that no estimate knows yet; since when
+        self._cuts = list[Piece]()  # since the last frame
+        self._ends: tuple[int, Points] | None = None  # of the electrode, as followed last, and when
 
     def check_frame(self, frame_id: str) -> None:
         """Raises InputError: its poses are in another frame than the results."""
@@ -180,7 +192,8 @@ class TipTool(Tool):
             self._touch(now_ns)
         fresh = [one for one in self._waiting if abs(now_ns - one[0]) <= _KEPT_NS]
         self.counts["dropped"] += len(self._waiting) - len(fresh)
-        self._waiting, given = fresh, [piece for _, piece in fresh]
+        self._waiting, given = fresh, [*(piece for _, piece in fresh), *self._cuts]
+        self._cuts = []
         if self._on and self._point and (tip_mm := self._tip(now_ns)) is not None:
             given.append(Piece(Grasp, tip_mm[:1], self._point))
             self.counts["grasp"] += 1
@@ -210,7 +223,7 @@ class TipTool(Tool):
         return piece.kind(**places, **piece.fields, **about)  # type: ignore[arg-type]
 
     def _click(self, now_ns: int) -> None:
-        if self.config.holds:
+        if self.config.holds or self._bare_mm:
             self._change(now_ns, not self._on)
         elif not self._on:
             self._change(now_ns, True)
@@ -221,10 +234,14 @@ class TipTool(Tool):
             self._began_ns, self._told_ns, self._point = stamp_ns, 0, None
         if self._on and not on:
             self._touch(stamp_ns, over=True)
+        if self._bare_mm and on and not self._on:
+            self._told_ns, self._ends = stamp_ns - _STEP_NS, None
         self._on, self._changed_ns = on, stamp_ns
 
     def _touch(self, now_ns: int, over: bool = False) -> None:
         """The touches of a contact that are known by now; ``over``: it ends now."""
+        if self._bare_mm:
+            return self._cut(now_ns)
         end_ns = self._began_ns + _MEAN_NS
         if self.config.holds or (now_ns < end_ns and not over):
             return
@@ -242,6 +259,36 @@ class TipTool(Tool):
                 if tip_mm is not None and np.linalg.norm(tip_mm[0] - self._told_mm) >= _SWEEP_MM:
                     self._touches(tip_mm[0], self._told_ns)
 
+    def _cut(self, now_ns: int) -> None:
+        """What the energised electrode has swept until now, as far as its poses are known."""
+        if self._told_ns > now_ns:  # the clock was set back
+            self._told_ns, self._ends = now_ns, None
+        first_ns = max(self._told_ns, now_ns - _LONGEST_CUT_NS) + _STEP_NS
+        left_out, away_mm = first_ns - self._told_ns > _STEP_NS, np.array([0, self._bare_mm])
+        swept = [] if self._ends is None else [self._ends]
+        for self._told_ns in range(first_ns, now_ns + 1, _STEP_NS):
+            if (ends_mm := self._along(self._told_ns, away_mm)) is None:
+                continue
+            if swept and self._told_ns - swept[-1][0] > _BOUNCE_NS:
+                swept = self._sweep(swept)[:0]
+            elif len(swept) > _CUT_AT_ONCE:
+                swept = self._sweep(swept)[-1:]
+            swept.append((self._told_ns, ends_mm))
+        self._sweep(swept)
+        known_ns = self._began_ns if self._ends is None else self._ends[0]
+        if left_out or now_ns - known_ns > _BOUNCE_NS:
+            self.context.controls.cut.set()
+
+    def _sweep(self, swept: list[tuple[int, Points]]) -> list[tuple[int, Points]]:
+        """A piece of these ends of the electrode, if there is a new one."""
+        if swept and (self._ends is None or swept[-1][0] > self._ends[0]):
+            self._ends = swept[-1]
+            places_mm = swept_places(np.array([ends_mm for _, ends_mm in swept]), _CUT_MM)
+            fields = {"kerf_mm": self.config.kerf_mm}
+            self._cuts.append(Piece(Cut, places_mm, fields, swept[-1][0]))
+            self.counts["cut"] += 1
+        return swept
+
     def _touches(self, place_mm: Float64[np.ndarray, " 3"], stamp_ns: int) -> None:
         config, self._told_mm = self.config, place_mm
         kind: type[Evidence] = Touch
@@ -255,10 +302,14 @@ class TipTool(Tool):
         self._waiting.append((stamp_ns, piece))
 
     def _tip(self, stamp_ns: int) -> Points | None:
-        """The tip, and places along the shaft from there, published frame; None: unknown."""
+        """The tip, and places along the shaft behind what cuts, published frame; None: unknown."""
+        shaft_mm = np.arange(self._bare_mm + _SHAFT_MM, self.config.shaft_mm + 1e-9, _SHAFT_MM)
+        return self._along(stamp_ns, np.append(0.0, shaft_mm))
+
+    def _along(self, stamp_ns: int, away_mm: Float64[np.ndarray, " n"]) -> Points | None:
+        """Places so far from the tip along the tool, published frame; None: unknown."""
         tip_mm = np.array(self.config.tip)
         along = unit(-tip_mm) if tip_mm.any() else np.array([0.0, 0.0, -1.0])
-        away_mm = np.arange(0, self.config.shaft_mm + 1e-9, _SHAFT_MM)
         for late_ns in _LATE_NS:
             with suppress(NoEstimate):
                 pose = self.pose(stamp_ns - late_ns)

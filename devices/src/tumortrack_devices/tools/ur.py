@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Affine
 from tumortrack.live.values import SinkContext
 from tumortrack_devices.tools.tip import TipConfig, TipTool
@@ -27,6 +28,8 @@ class UrToolConfig(TipConfig, frozen=True, kw_only=True, tag="ur"):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_between("ur:", force_n=(0.2, 100))
+        if self.electrode_mm:
+            raise InputError("ur: its force does not tell that an electrode is energised.")
 
     def open(self, context: SinkContext, name: str) -> UrTool:
         return UrTool(self, context, name)
