@@ -173,6 +173,9 @@ class _Screen:
         for name, told in self._run.loop.views.tools.summary().items():
             words = [f"{count} {what}" for what, count in told.items() if what != "trouble"]
             say(f"tool {name}: {', '.join(words) or 'nothing'}.")
+        if told := self._run.loop.views.cuts.summary():
+            unknown = f", {told['unknown']:.0%} of the way unknown" if told["unknown"] else ""
+            say(f"cut: {told['known']} places, {told['in_use']} in use{unknown}.")
         for name, errors in statistics.errors.items():
             off = errors.summary()
             say(f"{name}: centre off by {off['p50']:.1f} mm (median; 95 %: {off['p95']:.1f} mm).")

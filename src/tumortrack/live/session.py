@@ -180,6 +180,7 @@ class Session:
             "table_in_camera": frames.watch and frames.watch.table_in_camera,
             "frame_notes": frames.notes,
             "tools": self.loop.views.tools.summary(),
+            "cut": self.loop.views.cuts.summary(),
             **self.summary(),
             **({} if self.controller is None else self.controller.summary()),
         }

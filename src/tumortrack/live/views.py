@@ -131,7 +131,7 @@ class ViewsLocator:
         frozen_s: float,
         seed: int,
     ) -> None:
-        self._follower, self._context = follower, context
+        self._follower, self._context, self.cuts = follower, context, follower.cuts
         self._region, self._frozen_s, self._seed = region, frozen_s, seed
         self.scan: Scan | None = None  # makes the first estimate, and is gone then
         self.scanned = ""  # what each of its views added
@@ -185,7 +185,7 @@ class ViewsLocator:
         self.evidence = (*evidence, *self.tools.evidence(lead))
         if self._context.controls.cut.is_set():  # also by tools
             self._context.controls.cut.clear()
-            self._follower.cuts.tell()
+            self.cuts.tell()
         estimate = self._follower.locate(
             organ,
             lead.seen.content,
@@ -230,7 +230,7 @@ class ViewsLocator:
         if controls.acknowledged.is_set():
             controls.acknowledged.clear()
             self._follower.disputes.acknowledge()
-            self._follower.cuts.deny()
+            self.cuts.deny()
         if controls.forgotten.is_set():
             controls.forgotten.clear()
             self._follower.forget()

@@ -55,6 +55,11 @@ class Cuts:
         self._in_use = self._asked = 0  # how many places the tracker knows, and the one to come
         self._since_ns = self._newest_ns = 0  # of places that no tracker was asked for
         self._coming: Future[Tracker] | None = None
+        shape = tracker.model.shape if isinstance(tracker.model, RegistrationModel) else None
+        if shape is not None and (cut := shape.cut) is not None:
+            before = tuple(map(tuple, cut.points_ct.tolist()))
+            self._keep(Cut(points_ct=before, kerf_mm=cut.kerf_mm), cut.points_ct, 0)
+            self._in_use = self._asked = self.known
 
     @property
     def known(self) -> int:
@@ -134,13 +139,19 @@ class Cuts:
 
     def reported(self, estimate: Estimate) -> Estimate:
         """With what is known of cuts by now, also where its tracker does not know it yet."""
-        if not (self.known or self._lost):
+        if not (about := self.summary()):
             return estimate
-        told = estimate.report.cut or CutReport()
+        told, known, unknown = estimate.report.cut or CutReport(), about["known"], about["unknown"]
+        return estimate.reporting(cut=msgspec.structs.replace(told, known=known, unknown=unknown))
+
+    def summary(self) -> dict[str, Any]:
+        """What is known of cuts, how much of it is in use, and of which share nobody knows where it
+        was (JSON types); empty: nothing was cut."""
+        if not (self.known or self._lost or self._told):
+            return {}
         unknown = self._lost / (self._lost + self._carried or 1)
-        return estimate.reporting(
-            cut=msgspec.structs.replace(told, known=self.known, unknown=unknown)
-        )
+        about = {"known": self.known, "in_use": self._in_use, "unknown": round(unknown, 3)}
+        return {**about, "told": self._told, "trouble": self.trouble}
 
     def _keep(self, cut: Cut, points_ct: Points, stamp_ns: int) -> None:
         model = self._first.model

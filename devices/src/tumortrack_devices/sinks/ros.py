@@ -21,7 +21,7 @@ _FLUSH_S = 0.2  # for the last messages to leave
 _EMPTY = "std_msgs/msg/Empty"
 ACKNOWLEDGE, HALT, POINT_AT = ("acknowledge", _EMPTY), ("halt", _EMPTY), ("point_at", PLACE)
 _FARTHEST_M = 10.0  # of a place that is pointed at: no camera here sees so far
-ASKED = dict((ACKNOWLEDGE, ("forget", _EMPTY), HALT, POINT_AT))
+ASKED = dict((ACKNOWLEDGE, ("cut", _EMPTY), ("forget", _EMPTY), HALT, POINT_AT))
 
 
 class Ros2SinkConfig(SinkConfig, frozen=True, kw_only=True, tag="ros2"):
@@ -99,6 +99,8 @@ class RosSink:
         asked = {name: subscriber.take() for name, subscriber in self._asked.items()}
         if asked["acknowledge"]:
             self._controls.acknowledged.set()
+        if asked["cut"]:
+            self._controls.cut.set()
         if asked.get("halt"):
             self._controls.aborted.set()
         if asked["forget"]:

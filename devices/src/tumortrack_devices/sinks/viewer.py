@@ -41,6 +41,7 @@ _COARSER = 2  # the CT is sampled coarser: a pixel in the panel is less than a v
 # For viser's thread to pause, else changes may arrive in pieces: on a busy machine, or in a full
 # garbage collection, it may not run for a second.
 _PARKED_S = 5.0
+_CONTRADICTED = "evidence", "disputed", "cut_unknown"  # what a user may say was wrong
 _SAME_ORGAN_MM = 3.0  # a case's surface may differ from the model's by so much
 
 
@@ -126,6 +127,7 @@ class ViewerSink:
         panel.clicks[False].on_click(lambda _: self._ask(False))
         panel.forget.on_click(lambda _: self._forget())
         panel.acknowledge.on_click(lambda _: self._context.controls.acknowledged.set())
+        panel.cut.on_click(lambda _: self._context.controls.cut.set())
         if self._context.tools:
 
             @panel.touches.on_click
@@ -228,7 +230,7 @@ class ViewerSink:
         about = age_s, self._counter, arms, self._context.parts
         self.panel.stage.content = StatusPanel(state, result, *about).stage()
         finding = None if result is None else result.finding
-        contradicted = finding is not None and finding.kind in ("evidence", "disputed")
+        contradicted = finding is not None and finding.kind in _CONTRADICTED
         if self.panel.acknowledge.visible is not contradicted:
             self.panel.acknowledge.visible = contradicted
 

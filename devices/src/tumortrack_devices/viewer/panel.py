@@ -250,11 +250,16 @@ class Panel:
             }
             self.colour = gui.add_html("")
             self.forget = gui.add_button("Forget", color="gray", visible=False)
+            self.cut = gui.add_button(
+                "It is being cut",
+                color="gray",
+                hint="With no tool that says where: until one does, no answer is good",
+            )
             self.acknowledge = gui.add_button(
-                "The touch was wrong",
+                "That was wrong",
                 color="gray",
                 visible=False,
-                hint="What contradicts the answer counts no more",
+                hint="What contradicts the answer counts no more; or, it was not cut",
             )
         with gui.add_folder("Show"):
             shown |= {

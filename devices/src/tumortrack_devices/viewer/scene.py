@@ -6,7 +6,7 @@ not overlap: the sink holds a lock.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
@@ -64,7 +64,7 @@ class ViewerScene:
         self._pose = context.published_frame.published_from_camera
         self._at_rest, self._margins_ct = context.anatomy_ct, None
         if self._at_rest is not None:
-            self._bare_faces = bare_faces(self._at_rest)
+            self._faces, self._bare_faces = self._at_rest.organ.faces, bare_faces(self._at_rest)
             if margin_mm:
                 self._margins_ct = [exact_margin(part, margin_mm) for part in self._at_rest.tumors]
         self.options = DisplayOptions()
@@ -176,10 +176,7 @@ class ViewerScene:
         self.margins = self._margins_of(result, estimate)
         meshes = {**estimate.meshes}
         if self._name in meshes:
-            organ = meshes[self._name]
-            if self._at_rest is not None and np.array_equal(self._at_rest.organ.faces, organ.faces):
-                organ = Mesh(organ.vertices_mm, self._bare_faces)
-            meshes[self._name] = self.look.last_drawn(organ)
+            meshes[self._name] = self.look.last_drawn(self._bare(meshes))
         groups = (self._parts, meshes), (self._shells, self.margins)
         for nodes, surfaces in (*groups, (self._structures, estimate.structures)):
             for name, node in nodes.items():
@@ -188,6 +185,17 @@ class ViewerScene:
         self._put_extra_status(self.extra_status, tumors)
         self._shown = result, estimate
         self.apply()
+
+    def _bare(self, meshes: Mapping[str, Mesh]) -> Mesh:
+        """The organ's surface without what is also a tumor's, where it has the same triangles from
+        frame to frame: with a motion, until more is cut of it."""
+        organ = meshes[self._name]
+        if self._at_rest is None:
+            return organ
+        if not np.array_equal(self._faces, organ.faces):
+            self._faces = organ.faces
+            self._bare_faces = bare_faces(Anatomy(tuple(meshes.values())))
+        return Mesh(organ.vertices_mm, self._bare_faces)
 
     def hide(self) -> None:
         """Remove the estimate. Surfaces are emptied, not made invisible: browsers show one a frame

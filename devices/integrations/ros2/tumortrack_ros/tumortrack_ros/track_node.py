@@ -23,7 +23,12 @@ from tumortrack_ros.options import FIXED, OPTIONS, Option, check, command
 _LOOK_S = 0.2  # how often it is seen whether the command has ended, or must be started anew
 _FLUSH_S = 15.0  # for its sinks to say that it is over
 _REFUSED = 2  # the command's exit code where it does not take a value
-_ASKED = ("acknowledge", "forget", "halt")  # services, and the sinks' topics that they stand for
+_ASKED = (
+    "acknowledge",
+    "cut",
+    "forget",
+    "halt",
+)  # services, and the sinks' topics that they stand for
 _AUTOSTART = "be active at once, and end with tracking; else transitions decide, and it stays"
 Done = TransitionCallbackReturn
 
