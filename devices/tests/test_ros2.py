@@ -306,6 +306,8 @@ def test_a_user_halts_forgets_and_points_at_the_organ(bus: Bus, messages: Messag
             "forget", lambda: all(one.controls.forgotten.is_set() for one in (setting, unarmed))
         )
         assert not unarmed.controls.aborted.is_set()
+        assert not controls.cut.is_set()
+        until_heard("cut", lambda: controls.cut.is_set() and unarmed.controls.cut.is_set())
         np.testing.assert_allclose(point_at("table", 0.01, -0.02, 0.0), [10, -20, 0])
         np.testing.assert_allclose(point_at("camera", 0.01, -0.02, 0.13), [10, 20, 30], atol=1e-9)
     finally:

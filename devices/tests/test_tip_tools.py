@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from refused import refused
 from rtde_arm import RtdeArm
 from tumortrack.core.assessment import NOT_JUDGED
 from tumortrack.core.errors import InputError
-from tumortrack.core.evidence import FreeSpace, Grasp, Landmark, Outline, Touch
+from tumortrack.core.evidence import Cut, FreeSpace, Grasp, Landmark, Outline, Touch
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.io.csv_tables import COLUMNS, CONTACT
 from tumortrack.live.poses import pose_row
@@ -228,6 +229,80 @@ def test_a_landmark_is_touched_and_a_click_is_a_touch(tmp_path):
     assert [len(pieces) for pieces in given] == [0, 1, 1]
     holder.touched()
     assert frames(holder, [160], found((0, 0, 0))) == [[]]
+
+
+def hook(path, length_mm=12.0, contacts=None, count=60, **options):
+    """Its electrode lies along -z from its tip, and moves along x by 1 mm in 10 ms."""
+    poses = [facing((n, 0, 120), np.diag([1.0, -1, -1])) for n in range(count)]
+    contacts = [10 <= n < 40 for n in range(count)] if contacts is None else contacts
+    file = table(path / "hook.csv", poses, contacts)
+    return FileToolConfig(path=file, electrode_mm=length_mm, **options).open(setting(), "hook")
+
+
+def test_what_the_whole_electrode_sweeps_while_it_is_energised_is_cut(tmp_path):
+    tool = hook(tmp_path, kerf_mm=2.0)
+    frames_ms = range(0, 600, 33)
+    given = frames(tool, frames_ms)  # whether or not the organ is found
+    pieces = [piece for frame in given for piece in frame]
+    assert {type(piece) for piece in pieces} == {Cut}
+    assert len(pieces) == tool.counts["cut"]
+    assert {(piece.kerf_mm, piece.tool) for piece in pieces} == {(2.0, "hook")}
+    for now_ms, frame in zip(frames_ms, given, strict=True):
+        for piece in frame:
+            assert 0 <= STAMP_NS + now_ms * MS - piece.stamp_ns < 33 * MS + 20 * MS
+    places = np.concatenate([piece.places_mm for piece in pieces])
+    # A rectangle, from when it was energised to when no more, but for one step of time.
+    sheet = np.stack(np.meshgrid(np.arange(10, 38.5, 0.5), np.arange(0, 12.5, 0.5)), -1)
+    sheet = np.insert(sheet.reshape(-1, 2), 1, 0.0, axis=1) * [1, 1, -1] + [0, 0, 120]
+    near_mm = np.linalg.norm(sheet[:, None] - places, axis=2).min(1)
+    assert near_mm.max() <= 1.5 / 2**0.5 + 1e-6
+    low, high = places.min(0), places.max(0)
+    np.testing.assert_allclose([low[0], *low[1:], *high[1:]], [10, 0, 108, 0, 120], atol=1e-6)
+    assert high[0] <= 40
+
+
+def test_what_was_cut_while_no_camera_saw_the_organ_is_told_when_it_was(tmp_path):
+    tool = hook(tmp_path, contacts=[True] * 300, count=300)
+    pieces = frames(tool, [2900])[0]
+    stamps_ms = [(piece.stamp_ns - STAMP_NS) / MS for piece in pieces]
+    assert all(0 < b - a <= 520 for a, b in pairwise(stamps_ms))
+    assert stamps_ms[0] <= 520
+    assert stamps_ms[-1] > 2870
+    for piece, until_ms in zip(pieces, stamps_ms, strict=True):
+        assert max(x for x, _, _ in piece.places_mm) == pytest.approx(until_ms / 10)
+
+
+def test_an_electrode_that_is_energised_nobody_knows_where_tells_it(tmp_path):
+    tool = hook(tmp_path, contacts=[True] * 60)
+    assert frames(tool, [500])[0]
+    assert not tool.context.controls.cut.is_set()
+    frames(tool, [660])  # the last pose is of 590 ms
+    assert not tool.context.controls.cut.is_set()
+    assert frames(tool, [800]) == [[]]
+    assert tool.context.controls.cut.is_set()
+    off = hook(tmp_path, contacts=[False] * 60)
+    frames(off, [500, 800])
+    assert not off.context.controls.cut.is_set()
+
+
+def test_a_cutter_by_hand_and_its_shaft(tmp_path):
+    """Where it cuts there may be tissue."""
+    tool = hook(tmp_path, contacts=[False] * 60, shaft_mm=30.0)
+    ((free,),) = frames(tool, [100])
+    np.testing.assert_allclose([z for _, _, z in free.places_mm], [103, 98, 93], atol=1e-6)
+    tool.touched()
+    assert {piece.name for piece in frames(tool, [140, 180])[1]} == {"cut", "free_space"}
+    tool.touched()
+    frames(tool, [220])
+    assert [piece.name for piece in frames(tool, [300])[0]] == ["free_space"]
+
+
+@pytest.mark.parametrize("other", [{"holds": True}, {"sweep": True}, {"shaft_mm": 12.0}])
+def test_a_cutter_is_nothing_else(other, tmp_path):
+    with refused(InputError):
+        FileToolConfig(path=tmp_path, electrode_mm=12.0, **other)
+    with refused(InputError):
+        UrToolConfig(host="arm", electrode_mm=12.0)  # what it feels says nothing of current
 
 
 def test_of_a_moving_camera_the_pose_in_that_frame_counts(tmp_path):

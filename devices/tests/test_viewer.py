@@ -19,7 +19,7 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid, transform_points
 from tumortrack.core.mesh_query import exact_margin
 from tumortrack.core.patient import Patient
-from tumortrack.core.report import EvidenceReport
+from tumortrack.core.report import EvidenceReport, Finding
 from tumortrack.core.store import new_folder
 from tumortrack.core.types import Anatomy, LabelVolume, Mesh, Volume
 from tumortrack.io.case import Case, save_case
@@ -417,6 +417,20 @@ def test_arms_are_shown_without_an_estimate_and_never_after_silence(sinks, clock
     until(lambda: "nothing has come for" in sink.panel.stage.content, "silence")
     assert not nodes("/workcell").visible
     assert "nothing is known of them" in sink.panel.stage.content
+
+
+def test_a_user_says_that_it_is_being_cut_and_that_it_was_not(sinks):
+    setting = small_setting()
+    sink = sinks(setting, hz=60)
+    with page(sink) as visitor:
+        visitor.change("It is being cut")
+        until(setting.controls.cut.is_set, "the button")
+        assert not sink.panel.acknowledge.visible
+        poor = replace(small_update(), quality="poor", finding=Finding("cut_unknown"))
+        sink.publish(poor)
+        until(lambda: sink.panel.acknowledge.visible, "a way back")
+        visitor.change("That was wrong")
+        until(setting.controls.acknowledged.is_set, "the button")
 
 
 def test_keys_and_buttons_say_that_a_tool_touches_and_the_panel_how_much_is_known(sinks):

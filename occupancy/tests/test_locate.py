@@ -17,6 +17,7 @@ from stories import answered, cloud_by_rays, looking_down, refusal, succeeded, t
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.estimate import FollowOptions
+from tumortrack.core.evidence import Cut
 from tumortrack.core.geometry import IDENTITY, transform_points
 from tumortrack.core.types import Anatomy, SensorCloud, View
 from tumortrack.io.case import load_case
@@ -103,6 +104,8 @@ def test_a_moving_organ_is_followed_by_labels(tracker, seen):
         follower.locate(gone)
     assert follower.last_box_mm(gone.stamp_ns) is None
     assert "coarse" in follower.locate(cloud).report.timings
+    with refused(InputError):  # what was cut moves with a motion
+        follower.locate(cloud, evidence=[Cut(points_ct=((0.0, 0.0, 0.0),))])
 
 
 @pytest.mark.parametrize("jump_mm", [40.0, 300.0])

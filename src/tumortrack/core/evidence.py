@@ -150,14 +150,15 @@ class Cut(_Evidence, frozen=True, kw_only=True, tag="cut"):
     std_mm: float = 1.0
 
     def __post_init__(self) -> None:
-        if bool(self.places_mm) == bool(self.points_ct):
+        if len(self._left_out) != 1:
             raise InputError("cut: give places_mm (camera frame) or points_ct (CT), one of them.")
         super().__post_init__()
         self.check_between(self.name, kerf_mm=(0.1, 20.0))
 
     @property
     def _left_out(self) -> tuple[str, ...]:
-        return tuple(field for field in ("places_mm", "points_ct") if not getattr(self, field))
+        given = {"places_mm": self.places_mm, "points_ct": self.points_ct}
+        return tuple(name for name, places in given.items() if not len(places))
 
     def of_ct(self, points_ct: Points) -> Cut:
         """The same at points of the CT."""

@@ -24,6 +24,7 @@ from tumortrack.segmentation import Hints, RegionConfig, organ_points
 from tumortrack.segmentation.measured_noise import DepthNoise
 from tumortrack.segmentation.tissue import TissueClassifier
 from tumortrack.segmentation.watch import TableWatch
+from tumortrack.tracking.cuts import Cuts
 from tumortrack.tracking.follower import Follower
 from tumortrack.tracking.tracker import Tracker
 
@@ -131,7 +132,7 @@ class ViewsLocator:
         frozen_s: float,
         seed: int,
     ) -> None:
-        self._follower, self._context, self.cuts = follower, context, follower.cuts
+        self._follower, self._context = follower, context
         self._region, self._frozen_s, self._seed = region, frozen_s, seed
         self.scan: Scan | None = None  # makes the first estimate, and is gone then
         self.scanned = ""  # what each of its views added
@@ -146,6 +147,11 @@ class ViewsLocator:
         self._noises: dict[int, tuple[int, DepthNoise]] = {}  # of each camera, and when
         self.tools = Tools({}, context, self.frames.notes)
         self.evidence: tuple[Evidence, ...] = ()  # that the present frame brought
+
+    @property
+    def cuts(self) -> Cuts:
+        """What was cut of the organ."""
+        return self._follower.cuts
 
     def find(
         self, views: list[CameraView], absent: dict[int, str], seconds: dict[str, float]

@@ -120,7 +120,7 @@ class Cuts:
         waits, moves = stamp_ns - self._since_ns, stamp_ns - self._newest_ns
         if not (0 <= waits < _EVERY_NS and 0 <= moves < _RESTED_NS):
             self._asked = self.known
-            self._coming = self._pool.submit(_made, self._first, self._cuts())
+            self._coming = self._pool.submit(_made, self._first, self.all)
             if not self.beside:
                 wait([self._coming])
 
@@ -170,7 +170,9 @@ class Cuts:
             self._newest_ns = stamp_ns
             self._since_ns = stamp_ns if before == self._asked else self._since_ns
 
-    def _cuts(self) -> tuple[Cut, ...]:
+    @property
+    def all(self) -> tuple[Cut, ...]:
+        """What is known, of each tool, in places of the CT."""
         return tuple(
             Cut(
                 points_ct=tuple(of.places_ct.values()),
