@@ -325,13 +325,14 @@ class MotionReport(_Value, frozen=True, kw_only=True):
 
 class CutReport(_Value, frozen=True, kw_only=True):
     """What an answer knows of cuts: at how many places (one in each cube of 1.5 mm), how wide they
-    are, and which tumors have a flap. Live, ``known``: how many are known by now, also those that
-    the answer does not know yet; ``unknown``: of the rest of an electrode's way, the share of it,
-    nobody knows where in the organ it was."""
+    are, and which tumors have a flap; ``outliers``: share of the points beside it that lie on no
+    surface. Live, ``known``: how many places are known by now, also those that the answer does not
+    know yet; ``unknown``: of which share of an electrode's way nobody knows where it was."""
 
     places: int = 0
     kerf_mm: float = 0.0
     flaps: tuple[str, ...] = ()
+    outliers: float = 0.0
     known: int = 0
     unknown: float = 0.0
 

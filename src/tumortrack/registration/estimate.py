@@ -17,7 +17,6 @@ from tumortrack.core.raster import label_grid
 from tumortrack.core.report import (
     AllowedPoses,
     AlternativeFit,
-    CutReport,
     EvidenceReport,
     ExcludedFit,
     FitCost,
@@ -30,10 +29,10 @@ from tumortrack.core.report import (
 from tumortrack.core.rigid_fit import kabsch
 from tumortrack.core.types import Anatomy, CameraLabels, Mesh, OccupancyCloud, View
 from tumortrack.native import F32, F64, I32, kernel
-from tumortrack.organ.rest_shape import RestShape
 from tumortrack.registration.compliance import RefinedFit
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.evidence import TrackedEvidence
+from tumortrack.registration.flap import cut_report
 from tumortrack.registration.frame import Frame, describe_parts, grid_over, residuals
 from tumortrack.registration.gauss_newton import FARTHEST, RegistrationResult
 from tumortrack.registration.model import RegistrationModel
@@ -168,7 +167,7 @@ class EstimateMaker:
             ),
             views=fit.views.described() if len(views) > 1 else None,
             evidence=told,
-            cut=_cut_of(self._shape),
+            cut=cut_report(refined, config),
             fit_mm=residuals(np.abs(refined.distances_mm)),
             timings=frame.timings,
         )
@@ -286,12 +285,6 @@ def _evidence_of(
     new = [TrackedEvidence(piece, found.shown) for piece in found.pieces[len(before) :]]
     pairs = zip((*before, *new), reports, strict=True)
     return reports, tuple(known for known, entry in pairs if not entry.rejected)
-
-
-def _cut_of(shape: RestShape) -> CutReport | None:
-    if (cut := shape.cut) is None:
-        return None
-    return CutReport(places=len(cut.points_ct), kerf_mm=cut.kerf_mm, flaps=cut.flaps)
 
 
 def _fit_cost(

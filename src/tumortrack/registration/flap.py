@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 from jaxtyping import Bool, Float64
 from scipy import ndimage
@@ -23,13 +24,17 @@ from scipy.spatial import cKDTree
 from tumortrack.case.surface import largest_shell
 from tumortrack.core.errors import InputError
 from tumortrack.core.evidence import Cut
+from tumortrack.core.process import parallel_map
+from tumortrack.core.report import CutReport
 from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Mesh
 from tumortrack.organ.body import ElasticBody
 from tumortrack.organ.finite import CONTRAST, BlockCholesky, ElementLattice, LatticeSolid
 from tumortrack.organ.modes import RigidMotions, compliance_modes, patches_of
 from tumortrack.organ.rest_shape import FLAP_MODES, CutOrgan, DistanceField, RestShape
-from tumortrack.registration.gauss_newton import RegistrationResult
+from tumortrack.registration.compliance import RefinedFit
+from tumortrack.registration.config import GaussNewtonConfig
+from tumortrack.registration.gauss_newton import FARTHEST, RegistrationResult, refine
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.search import Start
 
@@ -43,8 +48,10 @@ _STEP_MM, _RIM_MM = 1.0, 2.0  # of the field with the groove; how far round a ke
 _NEAR_STEPS = 1.5  # from the last place of a cut, in its places' distances, it ends
 # What a flap bears, mN, each axis: its weight or a cup's pull; and how stiff tissue is, kPa. Both
 # are presumed (kidneys have 5 to 30 kPa): they decide how much has to be cut before a flap moves.
-_LOAD_MN, _TISSUE_KPA = 500.0, 15.0
+_LOAD_MN, _TISSUE_KPA = 2000.0, 15.0
 _MOST_MM = 8.0  # of a flap's motion, one deviation, however little holds it
+_BESIDE_MM = 10.0  # of a cut: there its flap and its bed are seen
+_SHIFTED = (1.0, 0.5, 0.5, 0.25)  # deviations: of a cut's shift, what is tried in turn
 _STARTED = 1.5  # deviations of a flap's shift, from which fits start
 
 
@@ -59,9 +66,9 @@ def cut_shape(shape: RestShape, cuts: Sequence[Cut], poisson: float) -> RestShap
     points_ct = _thinned(points_ct[shape.distances_mm(points_ct, 0) < _STEP_MM])
     if not len(points_ct):
         raise InputError("all that was cut lies off the organ: is it in the CT's frame (LPS, mm)?")
-    body, lattice = shape.body, _lattice_of(shape.body)
+    body, lattice = shape.body, lattice_of(shape.body)
     solid = LatticeSolid(shape.anatomy_ct, lattice, poisson)
-    crossed = _crossed(solid, points_ct)
+    crossed = crossed_cells(solid, points_ct)
     factor = solid.factor_of(_softened(solid, crossed))
     flaps = dict(_flaps(shape, solid, crossed, points_ct))
     modes, states = list[np.ndarray](), list[np.ndarray]()
@@ -69,7 +76,7 @@ def cut_shape(shape: RestShape, cuts: Sequence[Cut], poisson: float) -> RestShap
         mine, covariance = _modes_of(solid, factor, flap)
         modes.append(solid.spread(mine).astype(np.float32))
         states.append(covariance)
-    kerf_mm = max(cut.kerf_mm for cut in cuts)
+    kerf_mm, shared_mm = np.max([(c.kerf_mm, c.shared_std_mm) for c in cuts], axis=0).tolist()
     kerf = _kerf(shape.distances[0], points_ct, kerf_mm)
     field, organ = _grooved(shape.distances[0], kerf), _without(shape.anatomy_ct.organ, kerf)
     patches = patches_of(shape.anatomy_ct.organ, 600, np.random.default_rng(0))
@@ -83,7 +90,9 @@ def cut_shape(shape: RestShape, cuts: Sequence[Cut], poisson: float) -> RestShap
     )
     anatomy = replace(shape.anatomy_ct, parts=(organ, *shape.anatomy_ct.tumors))
     distances = (field, *shape.distances[1:])
-    return RestShape(anatomy, new, distances, CutOrgan(points_ct, kerf_mm, tuple(flaps), shape))
+    return RestShape(
+        anatomy, new, distances, CutOrgan(points_ct, kerf_mm, shared_mm, tuple(flaps), shape)
+    )
 
 
 def carried_over(motion: ElasticMotion, shape: RestShape) -> ElasticMotion:
@@ -114,7 +123,35 @@ def flap_starts(fit: RegistrationResult) -> list[Start]:
     return starts
 
 
-def _lattice_of(body: ElasticBody) -> ElementLattice:
+def with_shift(fit: RegistrationResult, config: GaussNewtonConfig) -> Cut | None:
+    """What was cut, shifted as fits the points best: where an electrode is errs by its calibration.
+    By trials, each with half the step of the one before. None: not at all."""
+    shape, shift = fit.motion.shape, np.zeros(3)
+    if (cut := shape.cut) is None or cut.shared_mm <= 0:
+        return None
+    near = msgspec.structs.replace(config, first_mm=config.last_mm)
+
+    def cost(shift_mm: Float64[np.ndarray, " 3"]) -> float:
+        kerf = _kerf(cut.intact.distances[0], cut.points_ct + shift_mm, cut.kerf_mm)
+        moved = replace(
+            shape, distances=(_grooved(cut.intact.distances[0], kerf), *shape.distances[1:])
+        )
+        again = refine(moved, fit.views, fit.motion, near)
+        return again.cost + float(shift_mm @ shift_mm) / cut.shared_mm**2
+
+    least = cost(shift)
+    for step_mm in cut.shared_mm * np.array(_SHIFTED):
+        ways = [shift + sign * step_mm * axis for axis in np.eye(3) for sign in (-1, 1)]
+        costs = parallel_map(cost, ways)
+        if min(costs) < least:
+            least, shift = min(costs), ways[int(np.argmin(costs))]
+    if not shift.any():
+        return None
+    places = tuple(map(tuple, (cut.points_ct + shift).tolist()))
+    return Cut(points_ct=places, kerf_mm=cut.kerf_mm)
+
+
+def lattice_of(body: ElasticBody) -> ElementLattice:
     return ElementLattice(body.origin_mm.astype(float), body.spacing_mm, body.modes.shape[:3])
 
 
@@ -126,7 +163,9 @@ def _thinned(points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "m 3"]:
     return np.asarray(sums / counts[:, None])
 
 
-def _crossed(solid: LatticeSolid, points_ct: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " c"]:
+def crossed_cells(
+    solid: LatticeSolid, points_ct: Float64[np.ndarray, "n 3"]
+) -> Bool[np.ndarray, " c"]:
     """Which cells are cut: by how densely places lie in them, against how densely they lie."""
     h, lattice = solid.lattice.spacing_mm, solid.lattice
     count = min(_NEIGHBOURS, len(points_ct))
@@ -272,4 +311,19 @@ def carried_to_ct(cuts: Sequence[Cut], motion: ElasticMotion) -> tuple[Cut, ...]
     made."""
     return tuple(
         cut if cut.points_ct else cut.of_ct(motion.inverse(np.array(cut.places_mm))) for cut in cuts
+    )
+
+
+def cut_report(fit: RefinedFit, config: GaussNewtonConfig) -> CutReport | None:
+    """What an answer knows of cuts; None: of none."""
+    if (cut := fit.motion.shape.cut) is None:
+        return None
+    points_ct = fit.motion.inverse(fit.views.points_mm)
+    beside = cKDTree(cut.points_ct).query(points_ct, distance_upper_bound=_BESIDE_MM)[0] < np.inf
+    far = np.abs(fit.distances_mm[beside]) > FARTHEST * fit.views.width_mm(config)
+    return CutReport(
+        places=len(cut.points_ct),
+        kerf_mm=cut.kerf_mm,
+        flaps=cut.flaps,
+        outliers=float(far.mean()) if beside.any() else 0.0,
     )

@@ -19,6 +19,7 @@ from tumortrack.core.ultrasound import ProbeRecording
 from tumortrack.registration.compliance import RefinedFit
 from tumortrack.registration.estimate import EstimateMaker, Found
 from tumortrack.registration.evidence import EvidenceTerms, TrackedEvidence, propagate
+from tumortrack.registration.flap import carried_over, with_shift
 from tumortrack.registration.frame import Frame
 from tumortrack.registration.gauss_newton import RegistrationResult, prior_precision
 from tumortrack.registration.model import RegistrationModel
@@ -56,6 +57,9 @@ class RegistrationLocator:
     ) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``."""
         frame, fit, method = self._registered(views, seed, evidence, any_pose)
+        if (cut := with_shift(fit, method.config)) is not None:
+            shifted = RegistrationLocator(self._model.with_cut([cut]))
+            return shifted.locate(views, grid, seed, evidence, any_pose)
         found = self._found(fit, method.prior, tuple(evidence))
         return self._maker.estimate(frame, views, found, self._refined(fit, frame), grid=grid)
 
@@ -153,6 +157,8 @@ class RegistrationLocator:
             pieces += how.evidence
             fit = found.fit.with_evidence(EvidenceTerms.from_evidence(pieces, self._touchable))
             return found._replace(fit=fit, pieces=pieces, before=before)
+        if start.shape is not self._model.shape:  # more was cut since
+            start = carried_over(start, self._model.shape)
         with frame.stage("follow"):
             starts = [start, *(alternative for alternative, _ in start.alternatives)]
             fits = [self._registration.follow(views, near, self._near) for near in starts]
@@ -204,11 +210,11 @@ class RegistrationLocator:
     def _smoothed(
         self, refined: RefinedFit, last: Estimate | None, stamp_ns: int, smoothing_s: float
     ) -> tuple[RefinedFit, float]:
-        """With the mean over past motions of the same body, and by how many seconds that lags
-        behind what moves steadily; a mean that lies too far behind is left out."""
+        """With the mean over past motions, and by how many seconds that lags behind what moves
+        steadily; a mean that lies too far behind is left out."""
         if last is None or not isinstance(last.motion, ElasticMotion) or smoothing_s <= 0:
             return refined, 0.0
-        if last.motion.shape is not refined.motion.shape:  # it was cut in between
+        if last.motion.shape is not refined.motion.shape:  # more was cut since
             return refined, 0.0
         past_s = (stamp_ns - last.cloud.stamp_ns) * 1e-9
         share = -math.expm1(-past_s / smoothing_s)

@@ -58,7 +58,8 @@ class Cuts:
         shape = tracker.model.shape if isinstance(tracker.model, RegistrationModel) else None
         if shape is not None and (cut := shape.cut) is not None:
             before = tuple(map(tuple, cut.points_ct.tolist()))
-            self._keep(Cut(points_ct=before, kerf_mm=cut.kerf_mm), cut.points_ct, 0)
+            known = Cut(points_ct=before, kerf_mm=cut.kerf_mm, shared_std_mm=cut.shared_mm)
+            self._keep(known, cut.points_ct, 0)
             self._in_use = self._asked = self.known
 
     @property

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,9 +17,6 @@ from tumortrack.core.evidence import Evidence
 from tumortrack.core.geometry import IDENTITY, Affine, transform_points
 from tumortrack.core.report import Likely
 from tumortrack.core.types import DepthFrame, SensorCloud, View
-from tumortrack.registration.flap import carried_over
-from tumortrack.registration.model import RegistrationModel
-from tumortrack.registration.motion import ElasticMotion
 from tumortrack.tracking.cuts import Cuts
 from tumortrack.tracking.tracker import Tracker, seen_from
 
@@ -114,7 +110,6 @@ class Follower:
             self._tracker = tracker
         evidence = self.cuts.take(evidence, cloud.stamp_ns, camera_from_last)
         last, self._last, self._at_rest = self._recent(cloud.stamp_ns), None, False
-        last = last and self._of_this_body(last)
         if last is not None and camera_from_last is not IDENTITY:
             last = seen_from(last, camera_from_last)
         earlier = () if last is not None else self._earlier(cloud.stamp_ns, camera_from_last)
@@ -156,15 +151,6 @@ class Follower:
         if finding is None or estimate.finding is not None:
             return estimate
         return estimate.assessed(finding=finding)
-
-    def _of_this_body(self, last: Estimate) -> Estimate:
-        """Of an organ of which less was cut then."""
-        model, start = self._tracker.model, last.unsmoothed
-        if not isinstance(model, RegistrationModel) or not isinstance(start, ElasticMotion):
-            return last
-        if start.shape is model.shape:
-            return last
-        return replace(last, unsmoothed=carried_over(start, model.shape))
 
     def _earlier(self, stamp_ns: int, camera_from_last: Affine) -> tuple[Any, ...]:
         """Evidence of before the organ was lost."""
