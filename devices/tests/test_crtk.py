@@ -148,12 +148,18 @@ class Arm:
         self._messages = bus.messages
         self._pose = bus.publisher("/PSM1/measured_cp", "geometry_msgs/msg/PoseStamped")
         self._jaw = bus.publisher("/PSM1/jaw/measured_js", JOINTS)
+        self._pedal = bus.publisher("/footpedals/coag", "sensor_msgs/msg/Joy")
 
     def place(self, stamp_ns: int, x_mm: float, frame: str = "PSM1_base", w: float = 1.0) -> None:
         header = self._messages.header(stamp_ns, frame)
         pose = {"position": {"x": x_mm / 1000}, "orientation": {"w": w}}
         kind = "geometry_msgs/msg/PoseStamped"
         self._pose(self._messages.to_bytes(self._messages.make(kind, header=header, pose=pose)))
+
+    def press(self, stamp_ns: int, *buttons: int) -> None:
+        header, pressed = self._messages.header(stamp_ns, ""), np.array(buttons, np.int32)
+        message = self._messages.make("sensor_msgs/msg/Joy", header=header, buttons=pressed)
+        self._pedal(self._messages.to_bytes(message))
 
     def jaw(self, stamp_ns: int, *angles_deg: float) -> None:
         header, position = self._messages.header(stamp_ns, ""), np.radians(angles_deg)
@@ -207,6 +213,34 @@ def test_a_jaw_that_closes_touches_until_it_opens_wide(arm: Arm, tool: CrtkTool)
     np.testing.assert_allclose(there_mm, [[35, 0, 0], [85, 0, 0]], atol=1e-6)  # of 0.1 s
 
 
+def test_an_electrode_cuts_while_its_pedal_is_pressed(arm: Arm) -> None:
+    """A jaw that closes, and a tap that has ended, energise nothing."""
+    context = replace(small_setting(), anatomy_ct=small_anatomy(), published_frame=BASE)
+    options = {"namespace": "/PSM1", "via": "dds", "electrode_mm": 6.0, "pedal": "/footpedals/coag"}
+    tool = CrtkToolConfig(**options).open(context, "hook")
+    said = {0: (), 200: (2,), 300: (1, 1), 500: (0, 1), 700: (2,)}
+    try:
+        for ms in range(0, 1001, 20):
+            now_ns = STAMP_NS + ms * MS
+
+            def both_came(ms: int = ms, now_ns: int = now_ns) -> bool:
+                arm.jaw(now_ns, 40 if ms < 600 else 0)
+                if ms in said:
+                    arm.press(now_ns, *said[ms])
+                arm.place(now_ns, ms / 10)
+                return x_mm(tool, now_ns) == pytest.approx(ms / 10)
+
+            until(both_came)
+            until(both_came)
+        view = CameraView(1, small_update(stamp_ns=now_ns).observation, BASE.published_from_camera)
+        (cut,) = tool.evidence(view)
+    finally:
+        tool.close()
+    there_mm = transform_points(BASE.published_from_camera, np.array(cut.places_mm))
+    low, high = there_mm.min(0), there_mm.max(0)
+    np.testing.assert_allclose([low, high], [[30, 0, -6], [50, 0, 0]], atol=1e-6)
+
+
 def test_what_is_invalid_or_in_another_frame_is_no_pose(arm, tool, monkeypatch) -> None:
     clock = Clock()
     monkeypatch.setattr("tumortrack_devices.tools.crtk.time", clock)
@@ -239,11 +273,20 @@ def test_what_is_invalid_or_in_another_frame_is_no_pose(arm, tool, monkeypatch) 
 
 @pytest.mark.parametrize(
     "options",
-    [{"namespace": "PSM1"}, {"pose": "measured cp"}, {"jaw": "/jaw"}, {"closed_deg": 100}],
+    [
+        *({"namespace": "PSM1"}, {"pose": "measured cp"}, {"jaw": "/jaw"}, {"closed_deg": 100}),
+        {"pedal": "coag"},
+    ],
 )
 def test_a_topic_that_ros_does_not_take_and_an_impossible_angle_are_refused(options) -> None:
     with refused(InputError, *options.values()):
         CrtkToolConfig(**({"namespace": "/PSM1"} | options))
+
+
+@pytest.mark.parametrize("options", [{"electrode_mm": 6.0}, {"pedal": "/footpedals/coag"}])
+def test_a_cutter_has_an_electrode_and_a_pedal(options) -> None:
+    with refused(InputError, "pedal"):
+        CrtkToolConfig(namespace="/PSM1", **options)
 
 
 def test_an_arm_needs_to_be_told_where_the_camera_is() -> None:

@@ -7,6 +7,7 @@ import math
 import time
 from typing import Any, ClassVar, Literal
 
+from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import Affine
 from tumortrack.live.poses import PoseBuffer
 from tumortrack.live.values import SinkContext
@@ -18,6 +19,7 @@ from tumortrack_devices.ros.sensors import frame_of
 from tumortrack_devices.ros.tf import pose_from
 from tumortrack_devices.tools.tip import TipConfig, TipTool
 
+_PEDAL = "sensor_msgs/msg/Joy"  # a dVRK's: 1 pressed, 0 released, 2 a tap that has ended
 _MOST = 1000  # messages between two frames: 30 Hz beside an arm of 1 kHz, and a few lost frames
 _SILENT_S = 5.0  # without a pose before it is said
 _WIDER_DEG = 5.0  # than it closed at: then it is open
@@ -30,6 +32,8 @@ class CrtkToolConfig(TipConfig, frozen=True, kw_only=True, tag="crtk"):
         pose: its topic below the namespace (PoseStamped): measured_cp, setpoint_cp, or
             local/measured_cp, which a dVRK gives in the arm's own base whatever base frame is set.
         jaw: its jaw's (JointState); empty: there is none, and touches are clicked.
+        pedal: topic of what energises it (Joy, its first button), such as a dVRK's
+            /footpedals/coag; needed with ``electrode_mm``, whose jaw says nothing then.
         closed_deg: it touches, or with ``holds`` grips, from when the jaw closes to this angle
             until it is 5 degrees wider. One that has not been seen open does neither.
     """
@@ -39,6 +43,7 @@ class CrtkToolConfig(TipConfig, frozen=True, kw_only=True, tag="crtk"):
     namespace: str
     pose: Literal["measured_cp", "local/measured_cp", "setpoint_cp"] = "measured_cp"
     jaw: str = "jaw/measured_js"
+    pedal: str = ""
     closed_deg: float = 10.0
     via: Via = "auto"
 
@@ -47,6 +52,10 @@ class CrtkToolConfig(TipConfig, frozen=True, kw_only=True, tag="crtk"):
         check_topic("pose", f"{self.namespace}/{self.pose}")
         if self.jaw:
             check_topic("jaw", f"{self.namespace}/{self.jaw}")
+        if self.pedal:
+            check_topic("pedal", self.pedal)
+        if bool(self.pedal) is not (self.electrode_mm > 0):
+            raise InputError("crtk: a cutter needs both electrode_mm= and pedal=TOPIC.")
         self.check_between("crtk:", closed_deg=(0, 90))
 
     def open(self, context: SinkContext, name: str) -> CrtkTool:
@@ -62,7 +71,10 @@ class CrtkTool(TipTool):
         self._bus, self._poses = open_bus(config.via), PoseBuffer()
         self._placed = self._bus.subscriber(self._topic, POSE, _MOST)
         jaw = f"{config.namespace}/{config.jaw}"
-        self._jaw = self._bus.subscriber(jaw, JOINTS, _MOST) if config.jaw else None
+        grips = config.jaw and not config.pedal
+        self._jaw = self._bus.subscriber(jaw, JOINTS, _MOST) if grips else None
+        pedal = config.pedal
+        self._pedal = self._bus.subscriber(pedal, _PEDAL, _MOST) if pedal else None
         self._open, self._closed = False, False  # as seen of the jaw
         self._heard_s = time.monotonic()
 
@@ -72,6 +84,9 @@ class CrtkTool(TipTool):
             self._move(read(raw, POSE))
         for raw in () if self._jaw is None else self._jaw.take():
             self._turn(read(raw, JOINTS))
+        for raw in () if self._pedal is None else self._pedal.take():
+            said = read(raw, _PEDAL)
+            self.contact(stamp_of(said.header) or stamp_ns, said.buttons[:1].tolist() == [1])
         if time.monotonic() - self._heard_s > _SILENT_S:
             self.trouble = f"no valid pose (geometry_msgs/PoseStamped) comes on {self._topic}"
 
