@@ -22,6 +22,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from tumortrack.case.surface import largest_shell
+from tumortrack.core.cloud import FEWEST_POINTS
 from tumortrack.core.errors import InputError
 from tumortrack.core.evidence import Cut
 from tumortrack.core.process import parallel_map
@@ -36,7 +37,8 @@ from tumortrack.registration.compliance import RefinedFit
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import FARTHEST, RegistrationResult, refine
 from tumortrack.registration.motion import ElasticMotion
-from tumortrack.registration.search import Start
+from tumortrack.registration.multi_view import MultiViewCloud
+from tumortrack.registration.search import far_from
 
 _APART_MM = 1.5  # between places of a cut that are kept
 _NEIGHBOURS = 10  # of a place of the cut, through which its plane is laid
@@ -52,6 +54,9 @@ _LOAD_MN, _TISSUE_KPA = 2000.0, 15.0
 _MOST_MM = 8.0  # of a flap's motion, one deviation, however little holds it
 _BESIDE_MM = 10.0  # of a cut: there its flap and its bed are seen
 _SHIFTED = (1.0, 0.5, 0.5, 0.25)  # deviations: of a cut's shift, what is tried in turn
+_MINE = 0.2  # of a cut's places that are nearest to a tumor: less was not cut for it
+_RESTS, _REST_STEPS = 2, 8  # of places of the rest from which fits start; of the way there
+_LIFTED_MM = 12.0  # from where a flap was: points so near may be its
 _STARTED = 1.5  # deviations of a flap's shift, from which fits start
 
 
@@ -71,6 +76,8 @@ def cut_shape(shape: RestShape, cuts: Sequence[Cut], poisson: float) -> RestShap
     crossed = crossed_cells(solid, points_ct)
     factor = solid.factor_of(_softened(solid, crossed))
     flaps = dict(_flaps(shape, solid, crossed, points_ct))
+    middles = lattice.origin_mm + lattice.spacing_mm * (solid.cells + 0.5)
+    places = {name: middles[flap] for name, flap in flaps.items()}
     modes, states = list[np.ndarray](), list[np.ndarray]()
     for flap in flaps.values():
         mine, covariance = _modes_of(solid, factor, flap)
@@ -91,7 +98,7 @@ def cut_shape(shape: RestShape, cuts: Sequence[Cut], poisson: float) -> RestShap
     anatomy = replace(shape.anatomy_ct, parts=(organ, *shape.anatomy_ct.tumors))
     distances = (field, *shape.distances[1:])
     return RestShape(
-        anatomy, new, distances, CutOrgan(points_ct, kerf_mm, shared_mm, tuple(flaps), shape)
+        anatomy, new, distances, CutOrgan(points_ct, kerf_mm, shared_mm, places, shape)
     )
 
 
@@ -106,21 +113,39 @@ def carried_over(motion: ElasticMotion, shape: RestShape) -> ElasticMotion:
     )
 
 
-def flap_starts(fit: RegistrationResult) -> list[Start]:
-    """With each flap shifted both ways along each axis: where an instrument hides half of it, one
-    descent may end in another minimum."""
-    motion, body = fit.motion, fit.motion.shape.body
-    starts = list[Start]()
-    first = body.modes.shape[-1] - motion.shape.flap_modes
-    for flap in range(first, body.modes.shape[-1], FLAP_MODES):
-        shift = slice(flap, flap + 3)
-        squares, axes = np.linalg.eigh(body.covariance[shift, shift])
-        for way in (axes * np.sqrt(squares) * _STARTED).T:
-            for sign in (-1, 1):
-                coefficients = motion.coefficients.copy()
-                coefficients[shift] += sign * way
-                starts.append(Start(replace(motion, coefficients=coefficients), fit.pose_offset))
-    return starts
+def flap_starts(
+    views: MultiViewCloud, starts: Sequence[ElasticMotion], config: GaussNewtonConfig
+) -> list[ElasticMotion]:
+    """Where fits of an organ that was cut start, beside ``starts``: those are of an organ in one
+    piece, and lie between a lifted flap and its rest. First the rest is fitted to the points beside
+    the flap; from there with each flap shifted both ways along each axis, and turned as it then
+    is."""
+    rests, few = list[ElasticMotion](), msgspec.structs.replace(config, steps=_REST_STEPS)
+    for start in starts:
+        if (cut := start.shape.cut) is None or not cut.flaps:
+            return []
+        flaps = cKDTree(np.concatenate(list(cut.flaps.values())))
+        away_mm = flaps.query(start.inverse(views.points_mm), distance_upper_bound=_LIFTED_MM)[0]
+        rest = np.flatnonzero(away_mm == np.inf)
+        if len(rest) < FEWEST_POINTS or len(rests) == _RESTS:
+            continue
+        some = replace(views, points_mm=views.points_mm[rest], view=views.view[rest])
+        motion = replace(refine(start.shape, some, start, few).motion, covariance=None)
+        if far_from(motion, rests):
+            rests.append(motion)
+    return [moved for motion in rests for moved in (motion, *_with_flaps_moved(motion))]
+
+
+def _with_flaps_moved(motion: ElasticMotion) -> Iterator[ElasticMotion]:
+    covariance = motion.shape.body.covariance
+    for first in range(len(covariance) - motion.shape.flap_modes, len(covariance), FLAP_MODES):
+        flap = slice(first, first + FLAP_MODES)
+        squares, axes = np.linalg.eigh(covariance[flap, first : first + 3][:3])
+        by_shift = covariance[flap, first : first + 3] @ axes / np.sqrt(squares)
+        for way in (*_STARTED * by_shift.T, *-_STARTED * by_shift.T):
+            coefficients = motion.coefficients.copy()
+            coefficients[flap] = way
+            yield replace(motion, coefficients=coefficients)
 
 
 def with_shift(fit: RegistrationResult, config: GaussNewtonConfig) -> Cut | None:
@@ -206,7 +231,7 @@ def _flaps(
     tumors = shape.anatomy_ct.tumors
     away_mm = [cKDTree(part.vertices_mm).query(points_ct)[0] for part in tumors]
     owner = np.argmin(away_mm, axis=0) if tumors else np.zeros(0, int)
-    for number in np.unique(owner):
+    for number in np.flatnonzero(np.bincount(owner) >= _MINE * len(owner)):
         off_mm = cKDTree(tumors[number].vertices_mm).query(middles)[0]
         off_mm[shape.distances_mm(middles, number + 1) < 0] = 0.0
         inside = (solid.organ > 0) & ~crossed & (off_mm < away_mm[number][nearest])
@@ -324,6 +349,6 @@ def cut_report(fit: RefinedFit, config: GaussNewtonConfig) -> CutReport | None:
     return CutReport(
         places=len(cut.points_ct),
         kerf_mm=cut.kerf_mm,
-        flaps=cut.flaps,
+        flaps=tuple(cut.flaps),
         outliers=float(far.mean()) if beside.any() else 0.0,
     )

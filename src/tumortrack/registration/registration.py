@@ -156,10 +156,10 @@ class Registration:
         best. ``known``: a fit of before."""
         fits = [] if known is None else [known]
         new = [Start(motion) for motion in starts if far_from(motion, [fit.motion for fit in fits])]
+        new += map(Start, flap_starts(views, starts, self.config))
         fits += self._fit_promising(views, new, fits)
         best = min(fits, key=lambda fit: cost_with_prior(fit, self.prior))
-        beside = [*turned_starts(best.motion, best.pose_offset), *flap_starts(best)]
-        fits += self._fit_promising(views, beside, fits)
+        fits += self._fit_promising(views, turned_starts(best.motion, best.pose_offset), fits)
         return select_best(fits, self.prior)
 
     def _fit_promising(
