@@ -66,7 +66,7 @@ class Located(Tracker):
     """Finds the small organ before whichever camera, and keeps what it was asked. ``verdicts``:
     good, poor or none, frame after frame."""
 
-    anatomy_ct = None
+    anatomy_ct = model = None
 
     def __init__(self, *verdicts):  # no model
         self._verdicts, self.asked = list(verdicts), []
