@@ -239,3 +239,24 @@ def test_a_touch_in_dispute_stays_where_it_is_on_the_new_surface(tracker, follow
     for n in range(3):  # there, as the answer has it
         follower.locate(seen(there, 2.2 + n / 10), evidence=[Touch(place_mm=tuple(end))])
     assert follower.locate(seen(there, 3)).quality == "good"
+
+
+def test_where_a_cut_organ_was_lost_its_pieces_are_taken_together_now_and_then(tracker, shell):
+    there, follower = lying(tracker), Follower(tracker, FollowerConfig())
+    boxes_s = np.arange(5, 6, 0.1) + 0.05
+
+    def boxes():
+        return [follower.last_box_mm(int(at_s * S)) is not None for at_s in boxes_s]
+
+    found = follower.locate(seen(there, 1))
+    follower.lose()
+    assert not any(boxes())  # a whole organ is one piece
+    found = follower.locate(seen(there, 2), evidence=[cut(shell)])
+    follower.lose()
+    assert sum(boxes()) == len(boxes_s) / 2
+    box_mm = next(
+        box for at_s in boxes_s if (box := follower.last_box_mm(int(at_s * S))) is not None
+    )
+    np.testing.assert_array_equal(box_mm, found.organ_mesh.box_mm)
+    follower.forget()
+    assert not any(boxes())

@@ -27,6 +27,9 @@ _TURNED_OVER_S = 30.0
 _CAUSES_EVERY_S = 1.0
 # Evidence outlasts a hand before the camera: tissue carries what lies on it, as it is seen again.
 _REMEMBERED_S = 60.0
+# Of an organ that is cut an image may show several pieces, of which only together are like it:
+# where it was lost, they are taken together in one tenth of a second, and in the next one not.
+_TOGETHER_NS = 100_000_000
 
 
 class FollowerConfig(Config, frozen=True, kw_only=True):
@@ -60,6 +63,7 @@ class Follower:
         self._last: Estimate | None = None
         self._scanned_ns, self._at_rest = 0, False
         self._known, self._known_ns = tuple[Any, ...](), 0  # evidence of the last estimate
+        self._found: Estimate | None = None  # the last one, however old
         self._good_ns: int | None = None
         self.disputes, self.cuts = Disputes(), Cuts(tracker)
         self._causes_ns, self._causes = 0, dict[str, tuple[Likely, ...]]()
@@ -69,7 +73,7 @@ class Follower:
 
     def forget(self) -> None:
         """Drop the last estimate and all evidence but cuts: after a new clock, or a new pick."""
-        self._last, self._known = None, ()
+        self._last, self._known, self._found = None, (), None
 
     def lose(self) -> None:
         """Drop the last estimate: the organ was not found."""
@@ -85,6 +89,8 @@ class Follower:
         """The organ's box in the last estimate, if that is recent enough; camera frame.
         ``camera_from_last``: from the camera frame of that estimate."""
         last = self._recent(stamp_ns)
+        if last is None and self.cuts.known and stamp_ns // _TOGETHER_NS % 2:
+            last = self._found
         if last is None:
             return None
         organ = last.organ_mesh
@@ -138,6 +144,7 @@ class Follower:
             raise
         self.cuts.settle(cloud.stamp_ns, self._last, camera_from_last)
         self._known, self._known_ns = self._last.evidence, cloud.stamp_ns
+        self._found = self._last
         if causes := self._last.causes:
             self._causes = {**self._causes, check_of(self._last): causes}
         if self._last.quality == "good":
