@@ -2,6 +2,7 @@
 
 import itertools
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from refused import refused
 from tumortrack.core.errors import InputError, NoPlan
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.mesh_query import contains
+from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Mesh
 from tumortrack_resection.arms import body, kinematics, procedure, trajectory
 from tumortrack_resection.arms.cell import (
@@ -30,11 +32,12 @@ from tumortrack_resection.arms.config import Base, CellConfig
 from tumortrack_resection.arms.cutting import Outside
 from tumortrack_resection.arms.paths import connect
 from tumortrack_resection.arms.procedure import Start, plan_motions, search_bases
-from tumortrack_resection.check import checked, clearances
-from tumortrack_resection.motions import CUTTER, HOLDER, JOINTS, Motions, Stage
+from tumortrack_resection.check import TOLERANCE_MM, checked, clearances
+from tumortrack_resection.motions import CUTTER, HOLDER, JOINTS, Execution, Motions, Stage
 from tumortrack_resection.operation import ResectionProgress
+from tumortrack_resection.strokes import trimmed
 from tumortrack_resection.urdf import UrdfCell
-from tumortrack_resection.values import ResectionConfig, ResectionPlan
+from tumortrack_resection.values import Located, ResectionConfig, ResectionPlan
 
 MODELS = pytest.mark.parametrize("model", kinematics.MODELS.values(), ids=lambda model: model.name)
 HOLDING = ("grasp", "hold")
@@ -387,6 +390,40 @@ def test_arms_begin_anew_in_the_middle_of_a_cut(cell, made, share):
     assert cKDTree(there.organ.spread_mm(1.0)).query(along)[0].min() > CONFIG.organ_clearance_mm
     assert np.array_equal(again.facets[:, :3], plan.facets[:, :3])
     checked(again, anew, body.cell_urdf(CONFIG), there)
+
+
+def grooved(located: Located, planes: np.ndarray, number: int, kerf_mm: float = 2.4) -> Located:
+    """The organ with one facet's kerf."""
+    inner, outer = planes.copy(), planes.copy()
+    inner[number - 1, 3] -= kerf_mm / 2
+    outer[number - 1, 3] += kerf_mm / 2
+    whole = solid_of(located.organ, "the organ")
+    kerf = trimmed(whole, outer, 0.0) - trimmed(whole, inner, 0.0)
+    return replace(located, meshes={**located.meshes, "kidney": mesh_of(whole - kerf)})
+
+
+def test_what_is_cut_stays_cut_and_the_rest_is_planned_on_the_organ_with_its_groove(ours, cell):
+    plan, motions = ours
+    first, open_ = sweeps(plan)[0], grooved(seen(), plan.facets, 1)
+    end = next(stage for stage in motions.stages if stage.name == first).joints_rad[-1]
+    again, anew = plan_motions(open_, OURS, CONFIG, Start(end, 2), plan)
+    assert [stage.name for stage in anew.stages] == [*sweeps(plan)[1:], *LAST]
+    assert np.array_equal(again.facets[:, :3], plan.facets[:, :3])
+    assert np.array_equal(again.cuts[0].path_mm, plan.cuts[0].path_mm)
+    assert np.array_equal(again.grasp_mm, plan.grasp_mm)  # the cup stays where it holds
+    assert np.array_equal(again.lift, plan.lift)
+    kept = checked(again, anew, body.cell_urdf(CONFIG), open_).least_mm["tumor_1"]
+    assert kept > OURS.margin_mm - TOLERANCE_MM
+    # Its sweep had not ended: there is nothing left to cut of it, and it is gone past at once.
+    _, anew = plan_motions(open_, OURS, CONFIG, Start(end, 1), plan)
+    assert [stage.name for stage in anew.stages] == [*sweeps(plan), *LAST]
+    assert anew.stages[0].seconds == 0
+    execution = Execution(anew)
+    assert (execution.sweep, execution.holds) == (1, True)
+    execution.step(0.1)
+    assert execution.sweep == 2
+    with pytest.raises(NoPlan):  # as nothing holds it, it could be another piece
+        plan_motions(open_, OURS, CONFIG, Start(end), plan)
 
 
 @pytest.mark.slow

@@ -17,9 +17,11 @@ from plan_objects import RADIUS_MM, TUMOR_MM, located, sphere
 from refused import refused
 from reports import bounded
 from tumortrack.core.errors import InputError, NoPlan
+from tumortrack.core.geometry import rigid, transform_points, turned_by
+from tumortrack.core.types import Mesh
 from tumortrack_resection.budget import ErrorBudget, LiveBudget
 from tumortrack_resection.drafts import plan_resection
-from tumortrack_resection.halt import CUT_NOTE, Halt
+from tumortrack_resection.halt import Halt
 from tumortrack_resection.motions import JOINTS, Execution, Motions, MotionStage, Stage
 from tumortrack_resection.operation import (
     Following,
@@ -315,7 +317,7 @@ def test_a_tumor_that_moved_is_planned_anew_once_it_has_settled():
 
 
 def test_a_tumor_that_moves_in_the_second_sweep_is_held_and_cut_on_from_there():
-    world = World(config=OperationConfig(settled_s=0.2, replan_cut=True))
+    world = World()
     world.until("sweep 2")
     world.frames(10)
     world.shift = np.array([0.0, 0.0, 4.0])
@@ -335,7 +337,7 @@ def test_a_tumor_that_moves_while_the_instrument_withdraws_loses_no_sweep():
         states = (Stage.WITHDRAW, *STATES[STATES.index(f"sweep {progress.first_sweep}") :])
         return Planned(PLAN, organ.meshes, motions(states, joints_rad))
 
-    world = World(replan, OperationConfig(settled_s=0.2, replan_cut=True))
+    world = World(replan)
     world.until("sweep 2")
     world.shift = np.array([0.0, 0.0, 4.0])
     cell = world.until(Stage.WITHDRAW)
@@ -350,21 +352,56 @@ def test_a_tumor_that_moves_while_the_instrument_withdraws_loses_no_sweep():
     world.until(Stage.DONE)
 
 
-def test_after_the_first_sweep_began_results_are_marked_and_nothing_is_planned_unasked():
-    world = World()
-    assert "intact" not in world.until("hold").state
-    assert world.operation.summary()["resection"]["note"] == ""
-    assert world.until("sweep 1").state == f"sweep 1 ({CUT_NOTE})"
+def test_where_an_organ_that_is_cut_has_no_plan_the_arms_halt_and_seek_one_again():
+    """They stand as they are: it goes on from there, with a later plan or where it was."""
+
+    def refuses(organ, joints_rad, progress):
+        world.calls.append(progress)
+        raise NoPlan("the holder can't reach it")
+
+    world = World(refuses)
+    world.until("sweep 1")
     world.shift = np.array([0.0, 0.0, 4.0])
-    cell = world.frames(200)
-    assert cell.halt.kind == "moved"
-    assert cell.halt.cut
-    assert cell.halt.values["off_mm"] == pytest.approx(4.0)
+    while not world.calls:
+        cell = world.frame()
+    cell = world.frames(100)
+    assert (cell.halt.kind, cell.halt.values["message"]) == ("no_plan", "the holder can't reach it")
     assert plain(cell) == "sweep 1"
-    assert not world.calls
+    assert world.calls == [ResectionProgress(True, 0)]
+    cell = world.frames(100)  # seconds later
+    assert world.calls == 2 * [ResectionProgress(True, 0)]
+    stood = cell.joints_rad
     world.shift = np.zeros(3)
+    assert world.frame().joints_rad == stood
+    world.made = world.replan
+    world.until("sweep 2")
+    world.shift = np.array([0.0, 0.0, 4.0])
     world.until(Stage.DONE)
-    assert world.operation.summary()["resection"]["note"] == CUT_NOTE
+    assert world.calls[-1][1] == 2
+
+
+def test_facets_and_grasp_go_with_the_tumor_and_what_they_are_planned_on_is_the_flap_as_it_is():
+    """A flap that is lifted and turned has its walls elsewhere."""
+    whole = plan_resection(LOCATED, ResectionConfig(tumor="tumor_1"))
+    world = World(plan=whole)
+    world.until("sweep 1")
+    world.frames(5)
+    turned = rigid(turned_by(np.radians([20.0, -10.0, 0.0])), np.array([2.0, 1.0, 8.0]))
+    tumor = LOCATED.meshes["tumor_1"]
+    lifted = tumor.with_vertices(transform_points(turned, tumor.vertices_mm))
+    world.located = replace(LOCATED, meshes={**LOCATED.meshes, "tumor_1": lifted})
+    while not world.before:
+        world.frame()
+    before = world.before[0]
+    for axis, plane, made, cut in zip(
+        before.facets[:, :3], before.facets, whole.cuts, before.cuts, strict=True
+    ):
+        at = transform_points(turned, made.path_mm)
+        assert cut.path_mm == pytest.approx(at)
+        assert at @ axis == pytest.approx(plane[3])  # the tip stays in its facet
+        assert cut.axis == pytest.approx(turned[:3, :3] @ made.axis)
+    assert before.lift == pytest.approx(turned[:3, :3] @ whole.lift)
+    assert before.grasp_mm == pytest.approx(transform_points(turned, whole.grasp_mm[None])[0])
 
 
 @pytest.mark.parametrize("part", ["kidney", "tumor_1", "tumor_2"])
@@ -468,6 +505,25 @@ def test_arms_stand_while_the_errors_exceed_the_margin_and_go_on_when_they_shrin
     assert list(world.operation.halts.values()) == [1]
 
 
+@pytest.mark.parametrize(("bound_mm", "pace"), [(4.2, 0.58), (6.0, 0.4), (8.9, 0.25)])
+def test_the_less_is_known_of_a_tumor_the_slower_are_the_sweeps(bound_mm, pace):
+    world, _ = budgeted(tumor_1=10.0, tumor_2=30.0)
+    changes = off_by(bound_mm)
+    world.until("sweep 1", **changes)
+    world.frames(5, **changes)
+    before, at_s = world.joints_rad, world.now_s
+    cell = world.frames(3, **changes)
+    slow_rad = np.abs(world.joints_rad - before).max() / (world.now_s - at_s)
+    assert f"{pace:.0%}" in cell.line
+    free = World(plan=world.planned.plan)
+    free.until("sweep 1")
+    free.frames(2)
+    before, at_s = free.joints_rad, free.now_s
+    assert "%" not in free.frames(2).line
+    fast_rad = np.abs(free.joints_rad - before).max() / (free.now_s - at_s)
+    assert slow_rad / fast_rad == pytest.approx(pace, rel=0.1)
+
+
 def test_less_motion_than_allowed_can_be_too_much_and_is_planned_anew():
     world, changes = budgeted(tumor_1=5.6, tumor_2=30.0)
     world.until("approach", **changes)
@@ -558,5 +614,12 @@ def test_surfaces_of_other_triangles_are_compared_by_their_distance():
 
     a, b = sphere(TUMOR_MM, RADIUS_MM), sphere(TUMOR_MM + [3.0, 4.0, 0.0], RADIUS_MM, finer=3)
     assert 2.0 < distance_mm(a, b) < 5.0  # between the surfaces, some of which slide
+    wall = sphere(TUMOR_MM, 0.3 * RADIUS_MM)  # a new one
+    more = Mesh(
+        np.concatenate([a.vertices_mm, wall.vertices_mm]),
+        np.concatenate([a.faces, wall.faces + len(a.vertices_mm)]),
+    )
+    assert distance_mm(more, a) == 0
+    assert distance_mm(a, more) > 2
     assert distance_mm(a, sphere(TUMOR_MM, RADIUS_MM, finer=3)) < 0.7
     assert distance_mm(a, a.with_vertices(a.vertices_mm + [0, 0, 2.0])) == pytest.approx(2.0)

@@ -13,9 +13,10 @@ import trimesh
 from matplotlib.figure import Figure
 from PIL import Image
 
+from live_objects import STAMP_NS, small_anatomy, small_setting, small_update
 from picture_words import LONG, PATIENT, check
 from plan_objects import TUMOR_MM, located, sphere
-from tumortrack.core.colours import ENERGISED, NONE, sweep_colour
+from tumortrack.core.colours import ENERGISED, NONE, NOW, sweep_colour
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import rigid
 from tumortrack.core.patient import Patient
@@ -23,7 +24,7 @@ from tumortrack.core.types import Mesh
 from tumortrack.live.values import RigidShape
 from tumortrack.report.drawing import new_figure
 from tumortrack_resection.drafts import plan_resection
-from tumortrack_resection.film import divided, film, moments
+from tumortrack_resection.film import TRUE, FilmSinkConfig, divided, film, moments
 from tumortrack_resection.motions import Motions, MotionStage
 from tumortrack_resection.pictures import ABOVE, Body, draw_plan, plan_figure, shaded, side_view
 from tumortrack_resection.values import (
@@ -38,6 +39,7 @@ from tumortrack_resection.values import (
     ResectionConfig,
     ResectionPlan,
 )
+from tumortrack_resection.workcell import Workcell
 
 WARNINGS = (
     f"{POOR_ESTIMATE}: only 12% of the organ's surface is seen, and 3 of 1000 points lie farther "
@@ -232,6 +234,48 @@ def test_a_film_shows_every_frame_what_moves_and_its_words(tmp_path: Path, monke
     assert min(red[:-1]) > 5_000 > red[-1]
     with pytest.raises(InputError):
         film(planned(), seen(), motions, draw, tmp_path / "a.mp4")
+
+
+def test_a_film_of_what_is_followed_shows_it_over_the_truth_and_why_the_arms_stand(tmp_path: Path):
+    """Also while nothing is found; with every word."""
+    stick = trimesh.creation.box((3, 3, 150))
+    shapes = (
+        RigidShape(
+            "cutter/electrode", solid(stick), rigid(np.eye(3), np.array([60.0, 0, 80])), NOW
+        ),
+    )
+    cell = Workcell("sweep 2", line="arms: sweep 2", shapes=shapes)
+    halted = replace(cell, stopped="planning again")
+    sink = FilmSinkConfig(path=tmp_path / "a.gif", every_s=0.1).open(small_setting())
+    there = small_anatomy()
+    lower = there.with_parts(p.with_vertices(p.vertices_mm + [0, 0, 12.0]) for p in there.parts)
+    for n in range(6):
+        result = replace(small_update(n, STAMP_NS + n * 50_000_000), control=cell)
+        seen_there = replace(result.observation, truth=lower if n == 2 else there)
+        if n < 5:
+            result = replace(result, observation=seen_there)
+        if n == 4:
+            result = replace(result, estimate=None, quality="none", control=halted)
+        sink.publish(result)
+    sink.publish(replace(small_update(9, STAMP_NS + 9_000_000_000), control=None))
+    sink.close()
+    with Image.open(tmp_path / "a.gif") as gif:
+        pictures = []
+        for n in range(gif.n_frames):
+            gif.seek(n)
+            pictures.append(np.asarray(gif.convert("RGB")).astype(int))
+    assert len(pictures) == 3  # of seven results, 0.1 s apart or more, with arms
+    dark, red = (
+        [int((np.abs(p - colour).max(2) < 45).sum()) for p in pictures] for colour in (TRUE, NONE)
+    )
+    orange = [((p[..., 0] > p[..., 2] + 60) & (p[..., 1] > p[..., 2] + 30)).sum() for p in pictures]
+    assert dark[1] > dark[0] + 50  # where the truth lies elsewhere
+    assert orange[2] < min(orange[:2]) / 2  # nothing was found
+    assert red[2] > 1000 > max(red[:2])
+    with pytest.raises(InputError):
+        FilmSinkConfig(path=tmp_path / "a.mp4")
+    with pytest.raises(InputError):
+        FilmSinkConfig(path=tmp_path / "a.gif").open(small_setting())
 
 
 def test_the_piece_leaves_with_the_holder(tmp_path: Path, monkeypatch):

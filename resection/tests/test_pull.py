@@ -84,9 +84,10 @@ class Procedure:
     def __init__(self, replan=None):
         self.shift_mm, self.now_s = np.zeros(3), 0.0
         config = OperationConfig(settled_s=0.1)
-        planned, grip = Planned(PLAN, LOCATED.meshes, motions()), Grip(tip_mm, 1.2)
+        planned, self.grip = Planned(PLAN, LOCATED.meshes, motions()), Grip(tip_mm, 1.2)
         draw = lambda joints: ()  # noqa: E731
-        self.operation = Operation(planned, config, draw, Following(self.locate, replan, grip=grip))
+        live = Following(self.locate, replan, grip=self.grip)
+        self.operation = Operation(planned, config, draw, live)
 
     def locate(self, update):
         meshes = {
@@ -160,7 +161,7 @@ def test_the_pull_itself_halts_nothing_and_then_it_is_planned_on_the_pulled_tumo
     plans = []
 
     def replan(update, joints_rad, progress, before):
-        assert before is PLAN
+        assert before.grasp_mm == pytest.approx(PLAN.grasp_mm + procedure.shift_mm)
         plans.append((joints_rad[6], progress))
         meshes = procedure.locate(update).meshes
         later = Motions(motions(STATES[5:]).stages)
@@ -173,7 +174,7 @@ def test_the_pull_itself_halts_nothing_and_then_it_is_planned_on_the_pulled_tumo
     procedure = Procedure(replan)
     procedure.until(Stage.PULL)
     for _ in range(20):
-        procedure.shift_mm = np.array([0.0, 0.0, procedure.operation._grip.pulled_mm])
+        procedure.shift_mm = np.array([0.0, 0.0, procedure.grip.pulled_mm])
         assert procedure.frame().halt is None
     while procedure.frame().state == Stage.PULL:
         pass
@@ -309,7 +310,7 @@ def test_a_live_pull_is_followed_planned_on_and_cut(ready_case, tmp_path):
     output = succeeded(
         tumortrack(
             "resect", tmp_path / "plan", "--live", ready_case, live, "--speed", 3,
-            "--report", tmp_path / "report.json", "--replan-cut",
+            "--report", tmp_path / "report.json",
         )
     )  # fmt: skip
     assert "done: both virtual arms are home." in output

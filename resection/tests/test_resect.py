@@ -51,7 +51,6 @@ from tumortrack_resection import begin_plan, begin_resection, plan_resection
 from tumortrack_resection.arms.body import cell_urdf
 from tumortrack_resection.arms.cell import tip_places
 from tumortrack_resection.files import read_plan
-from tumortrack_resection.halt import CUT_NOTE
 from tumortrack_resection.motions import JOINTS
 from tumortrack_resection.values import CUTS_TUMOR, ELECTRODE, OVER_BUDGET, POOR_ESTIMATE, UNCHECKED
 
@@ -648,7 +647,7 @@ def test_a_live_world_that_lies_elsewhere_is_planned_anew_and_cut(
         output = succeeded(
             tumortrack(
                 "resect", tmp_path / "plan", *sinks, "--live", elastic_model, world, "--speed", 10,
-                "--report", report, "--replan-cut",
+                "--report", report,
             )
         )  # fmt: skip
         end = read_plan(tmp_path / "plan").motions.stages[-1].joints_rad[-1, :6]
@@ -668,13 +667,25 @@ def test_a_live_world_that_lies_elsewhere_is_planned_anew_and_cut(
     note = content["resection"]["note"]
     for warning in warned:  # what the plan warned of stays
         assert warning in note
-    assert note.endswith(CUT_NOTE)
     assert any(entry.get("event") == "planned anew" for entry in passed)
     assert any("has moved by" in halt for halt in content["resection"]["halts"])
     assert content["frame"]["frame_id"] == "table"
     budgets = content["resection"]["budget"]
     assert budgets["worst"]["left_mm"] < 0  # accepted when it was planned
     assert budgets["worst"]["tracking_mm"] > 0
+
+
+def test_a_model_that_cannot_know_what_is_cut_is_refused_before_anything_moves(
+    quick_model, phantom_case, tmp_path, monkeypatch
+):
+    monkeypatch.setitem(WHOSE, "side", "right")
+    monkeypatch.setitem(globals(), "CASE", store.sha256_of(phantom_case / store.MANIFEST))
+    write_run(tmp_path / "run", tumor_1=BOUND_MM)
+    succeeded(tumortrack("plan", tmp_path / "run", tmp_path / "plan", *WIDE))
+    live = quick_model, f"virtual:{phantom_case}"
+    resection = begin_resection(tmp_path / "plan", live=live)
+    with refused(InputError, quick_model), resection.following():
+        pass
 
 
 def place_of(said):

@@ -50,6 +50,7 @@ _SPACING_MM = 0.5  # between points on the planned cuts
 
 _SPEED_S = 0.3  # time over which a speed is averaged: estimates jitter from frame to frame
 _GAP_S = 0.5  # an older position does not count for the speed
+_SLOWEST = 0.25  # pace of sweeps, however large a tumor's bound is
 
 
 class ErrorBudget(Config, frozen=True, kw_only=True):
@@ -303,6 +304,14 @@ class LiveBudget:
         if not covered or (worst := tightest(list(covered.values()))).left_mm >= 0:
             return None, False
         return worst.as_halt, msgspec.structs.replace(worst, motion_mm=0.0).left_mm >= 0
+
+    @property
+    def pace(self) -> float:
+        """Of sweeps, as a share: what the bound of the tumor that is the least safe leaves of its
+        distance from the electrode, but at least a quarter."""
+        if self.now is None or self.now.margin_mm <= 0:
+            return _SLOWEST
+        return max(1 - self.now.tracking_mm / self.now.margin_mm, _SLOWEST)
 
     def went_on(self) -> None:
         """The arms may move on the last estimate."""

@@ -27,7 +27,7 @@ from tumortrack.core.geometry import rotation_onto
 from tumortrack.core.mesh_query import contains
 from tumortrack.core.organ import is_tumor, organ_name
 from tumortrack.core.types import Mesh
-from tumortrack_resection.motions import Motions, Stage
+from tumortrack_resection.motions import Joints, Motions, Stage
 from tumortrack_resection.urdf import GRASPER, Configurations, Ends, Frames, ToolSolid, UrdfCell
 from tumortrack_resection.values import CUTS_TUMOR, ELECTRODE, Clearance, Located, ResectionPlan
 
@@ -287,6 +287,13 @@ def electrode_poses(
     solids = [next(solid for solid in cell.solids if solid.name == ELECTRODE)]
     poses = _Poses(cell, solids, motions, step_mm)
     return poses.ends_mm[0], poses.cuts
+
+
+def electrode_line(urdf: str) -> Callable[[Joints], Float64[np.ndarray, "2 3"]]:
+    """From both arms' joints to the same ends."""
+    cell = UrdfCell(urdf)
+    solids = [next(solid for solid in cell.solids if solid.name == ELECTRODE)]
+    return lambda joints_rad: cell.ends(solids, joints_rad[None])[0][0]
 
 
 def checked(plan: ResectionPlan, motions: Motions, urdf: str, located: Located) -> ResectionPlan:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -76,7 +76,8 @@ class Draft:
     tumors that come away. ``share``: of the tumor outside the organ's hull. ``piece``: None: the
     paper's method has none. ``keep_mm``: what the electrode keeps away from beside these.
     ``solid``: what comes away, closed. ``healthy``, ``kerf``: shares of the parenchyma that come
-    away with it, and that the electrode's width takes."""
+    away with it, and that the electrode's width takes. ``through``: sweeps that are no more
+    needed."""
 
     located: Located
     config: ResectionConfig
@@ -92,6 +93,7 @@ class Draft:
     healthy: float
     kerf: float
     notes: tuple[str, ...] = ()
+    through: Collection[int] = ()
 
     @property
     def lost(self) -> float:
@@ -136,13 +138,16 @@ class Draft:
 class Drafts:
     """The pieces that can be planned for one tumor, the best first; others once one or the other
     facet is left out. ``like``: an earlier plan, whose facets are kept, and with them what comes
-    away and what they keep away from."""
+    away and what they keep away from. ``done``: the cup holds its piece, and so many facets are
+    cut: these lie in the gap between the piece and the rest, as others do that the organ no
+    longer reaches."""
 
     def __init__(
         self, located: Located, config: ResectionConfig, tools: Tools,
-        like: ResectionPlan | None = None,
+        like: ResectionPlan | None = None, done: int | None = None,
     ) -> None:  # fmt: skip
         self._label, self._share = chosen_tumor(located, config)
+        self._done, self._held = done or 0, None if done is None else like
         _check_kept(located, config, name_of(self._label))
         self._located, self._config, self._tools, self._like = located, config, tools, like
         self._solid = solid_of(located.organ, "the organ's surface")
@@ -235,8 +240,8 @@ class Drafts:
     ) -> Draft | _Unfit:
         located, config, tools = self._located, self._config, self._tools
         facets = [Facet(self._sections, piece.planes, n) for n in range(1, len(piece.planes) + 1)]
-        full = [facet for facet in facets if not facet.empty]
-        if not full:
+        full = [facet for facet in facets if facet.number > self._done and not facet.empty]
+        if not full and not self._done:
             return _Unfit("the organ does not reach the tumor's margin; there is nothing to cut.")
         if swallowed := sorted({*piece.with_it} - {*targets}):
             return _Unfit(f"{name_of(swallowed[0])} would come away, too.")
@@ -245,20 +250,21 @@ class Drafts:
                 f"{piece.healthy:.0%} of the organ's healthy tissue would come away; allowed are "
                 f"{config.most_healthy:.0%}. Ask for a smaller margin, or allow more."
             )
-        if len(full) < len(facets):
+        if len(full) < len(facets) and self._held is None:
             if self._like is not None:
                 return _Unfit("the organ no longer reaches all facets of the earlier plan.")
             kept = [facet.number - 1 for facet in full]
             piece = replace(piece, planes=piece.planes[kept],
                             chosen=tuple(piece.chosen[n] for n in kept))  # fmt: skip
             return self._draft(search, piece, targets, room)
-        lift = cup_direction(piece.planes)
+        lift = self._held.lift if self._held else cup_direction(piece.planes)
         if lift is None:
             return _Unfit("the cup can't be held so that it lifts the piece out.")
-        sweeps = self._sweeps(facets, piece, lift)
+        through = {facet.number for facet in facets} - {facet.number for facet in full}
+        sweeps = self._sweeps(facets, piece, lift, through)
         if isinstance(sweeps, _Unfit):
             return sweeps
-        grasp_mm = grasp_point(located, self._label, piece, tools, lift)
+        grasp_mm = self._grasp(piece, lift)
         if grasp_mm is None:
             return _Unfit("there is no place on the piece on which the cup can come down.")
         rest = self._solid - trimmed(self._solid, piece.planes, -tools.radius_mm)
@@ -275,15 +281,26 @@ class Drafts:
             lift=lift, keep_mm=search.keep_mm,
             solid=solid, healthy=inner, kerf=outer - inner,
             notes=(*self._notes(targets, room, search), *_unguarded(located, config)),
+            through=through,
         )  # fmt: skip
 
+    def _grasp(self, piece: Piece, lift: Vector) -> Vector | None:
+        if self._held is not None:
+            return self._held.grasp_mm
+        return grasp_point(self._located, self._label, piece, self._tools, lift)
+
     def _sweeps(
-        self, facets: Sequence[Facet], piece: Piece, lift: Vector
+        self, facets: Sequence[Facet], piece: Piece, lift: Vector, through: Collection[int]
     ) -> tuple[tuple[Cut, ...], ...] | _Unfit:
-        """For each facet the ways to cut it, the best first."""
+        """For each facet the ways to cut it, the best first; of those that are ``through``, how
+        it was done."""
         sweeps: list[tuple[Cut, ...]] = []
         room_mm = self._tools.electrode_mm - _CLEAR_MM
         for facet, normal in zip(facets, piece.chosen, strict=True):
+            if facet.number in through:
+                assert self._held is not None
+                sweeps.append(tuple(c for c in self._held.cuts if c.sweep == facet.number))
+                continue
             strokes = [
                 facet.stroke(back, self._config)
                 for back in facet.directions(self._lowest)[:_MOST_WAYS]

@@ -1,12 +1,14 @@
-"""A film of a stored plan's motions: an animated GIF, drawn by matplotlib without a display."""
+"""A film of a stored plan's motions, or as a sink, ``film:FILE.gif``, of what is followed: an
+animated GIF, drawn by matplotlib without a display."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -17,8 +19,9 @@ from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.organ import is_tumor
 from tumortrack.core.solids import mesh_of, solid_of
-from tumortrack.core.store import write_atomically
-from tumortrack.live.values import RigidShape
+from tumortrack.core.store import check_place, write_atomically
+from tumortrack.core.types import Mesh
+from tumortrack.live.values import Polyline, RigidShape, SinkConfig, SinkContext, TrackingResult
 from tumortrack.report import drawing
 from tumortrack_resection.facets import TOOLS
 from tumortrack_resection.motions import Joints, Motions, MotionStage, Stage
@@ -34,6 +37,8 @@ _CLOSE_MM, _ROOM_MM = 70.0, 30.0  # half of what the close-up shows; beside the 
 _ORGAN_OPACITY = 0.42
 _LEAST_FRAMES, _LAST_MS = 3, 1600  # of a stage; of the last picture
 _TITLE = "PLAYBACK of a stored plan, SIMULATED: nothing is tracked"
+TRUE = (70, 70, 75)  # colour of the truth
+_MOST = 240  # pictures of a sink's film: from then on every second one is left out
 
 
 class Moment(NamedTuple):
@@ -68,17 +73,10 @@ def film(
     From the lift on the piece moves with the holder; after the release it is gone. Raises
     InputError: another kind of file; StorageError: the disk refused.
     """
-    if path.suffix.lower() != ".gif":
-        raise InputError(f"{path}: a film is an animated GIF; give a name that ends in .gif.")
+    _check_name(path)
     frames = moments(motions, FRAMES)
     arms = [shape for moment in frames[::6] for shape in draw(moment.joints_rad)]
-    ends = [
-        transform_points(shape.published_from_shape, shape.mesh.box_mm)
-        for shape in arms
-        if "/" in shape.name
-    ]
-    flat = np.concatenate([*ends, located.organ.vertices_mm]) @ _OBLIQUE[:2].T
-    boxes = flat.min(0) - _ROOM_MM, flat.max(0) + _ROOM_MM
+    boxes = _boxes(arms, located.organ)
     stays, goes = divided(located, plan)
     pictures: list[Image.Image] = []
     lifted = np.eye(4)
@@ -90,8 +88,44 @@ def film(
             moved = cup @ np.linalg.inv(lifted)
             piece = [body._replace(world_from_mesh=moved) for body in goes]
             bodies = stays if name == "home" else [*stays, *piece]
-            pictures.append(_picture(moment, shapes, bodies, boxes, plan, located))
+            over = name in (Stage.LIFT, Stage.RELEASE)
+            at = moment.stage.sweep or (plan.sweeps + 1) * over
+            lines = [
+                Polyline("", cut.path_mm,
+                         CUT if cut.sweep < at else NOW if cut.sweep == at else TO_CUT)
+                for cut in plan.cuts
+            ]  # fmt: skip
+            state = name + ": the electrode is energised" * moment.cutting
+            words = f"{_TITLE}\n{state}", plan.warnings, [str(located.patient)]
+            drawn = _coloured(shapes, moment.cutting)
+            pictures.append(_picture(drawn, bodies, lines, boxes, located.organ, words))
             progress(len(pictures), len(frames))
+    _write(pictures, path)
+    return len(frames) / FPS
+
+
+def _check_name(path: Path) -> None:
+    if path.suffix.lower() != ".gif":
+        raise InputError(f"{path}: a film is an animated GIF; give a name that ends in .gif.")
+
+
+def _boxes(shapes: Sequence[RigidShape], organ: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Of what is shown: arms and organ."""
+    ends = [
+        transform_points(shape.published_from_shape, shape.mesh.box_mm)
+        for shape in shapes
+        if "/" in shape.name
+    ]
+    flat = np.concatenate([*ends, organ.vertices_mm]) @ _OBLIQUE[:2].T
+    return flat.min(0) - _ROOM_MM, flat.max(0) + _ROOM_MM
+
+
+def _coloured(shapes: Sequence[RigidShape], cutting: bool) -> list[RigidShape]:
+    lit = f"cutter/{ELECTRODE}" if cutting else ""
+    return [replace(s, colour=ENERGISED) if s.name == lit else s for s in shapes]
+
+
+def _write(pictures: Sequence[Image.Image], path: Path) -> None:
     height, buffer = max(picture.height for picture in pictures), io.BytesIO()
     sheets = [Image.new("RGB", (picture.width, height), "white") for picture in pictures]
     for sheet, picture in zip(sheets, pictures, strict=True):
@@ -106,40 +140,92 @@ def film(
     more: dict[str, Any] = {"append_images": indexed[1:], "duration": lasting, "loop": 0}
     indexed[0].save(buffer, format="GIF", save_all=True, **more)
     write_atomically(path, buffer.getvalue())
-    return len(frames) / FPS
 
 
 def _picture(
-    moment: Moment, shapes: tuple[RigidShape, ...], bodies: list[Body],
-    boxes: tuple[np.ndarray, np.ndarray], plan: ResectionPlan, located: Located,
+    shapes: Sequence[RigidShape], bodies: list[Body], lines: Sequence[Polyline],
+    boxes: tuple[np.ndarray, np.ndarray], organ: Mesh, words: tuple[Any, ...],
 ) -> Image.Image:  # fmt: skip
     """The whole cell, and from near the organ, with words round them."""
     figure = drawing.new_figure(*_SIZE_IN, left=0.0, right=1.0, bottom=0.0, top=1.0)
-    axes, near = figure.add_subplot(), located.organ.box_mm.mean(0) @ _OBLIQUE[:2].T
-    lit = f"cutter/{ELECTRODE}" if moment.cutting else ""
+    axes, near = figure.add_subplot(), organ.box_mm.mean(0) @ _OBLIQUE[:2].T
     # A table's triangles are too large to be sorted among the others.
     layers = [
-        [Body(s.mesh, ENERGISED if s.name == lit else s.colour, s.opacity, s.published_from_shape)
+        [Body(s.mesh, s.colour, s.opacity, s.published_from_shape)
          for s in shapes if ("/" in s.name) == small]
         for small in (False, True)
     ]  # fmt: skip
     close = near - _CLOSE_MM, near + _CLOSE_MM
     for drawn, box in ((axes, boxes), (axes.inset_axes(_INSET), close)):
-        for layer in (*layers, bodies):
+        for layer in filter(None, (*layers, bodies)):
             shaded(drawn, layer, _OBLIQUE, box)
-        for cut in plan.cuts:
-            over = moment.stage.name in (Stage.LIFT, Stage.RELEASE)
-            at = moment.stage.sweep or (plan.sweeps + 1) * over
-            colour = CUT if cut.sweep < at else NOW if cut.sweep == at else TO_CUT
-            flat = cut.path_mm @ _OBLIQUE[:2].T
-            drawn.plot(*flat.T, color=np.array(colour) / 255, linewidth=1.4, zorder=3)
+        for line in lines:
+            flat = line.points_mm @ _OBLIQUE[:2].T
+            drawn.plot(*flat.T, color=np.array(line.colour) / 255, linewidth=1.4, zorder=3)
         (left, top), (right, low) = box
         drawn.set(xlim=(left, right), ylim=(low, top), xticks=[], yticks=[], aspect="equal")
-    state = moment.stage.name + ": the electrode is energised" * moment.cutting
-    drawing.add_words(figure, f"{_TITLE}\n{state}", plan.warnings, [str(located.patient)])
+    drawing.add_words(figure, *words)
     canvas = cast(FigureCanvasAgg, figure.canvas)
     canvas.draw()
     return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+
+
+class FilmSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="film"):
+    """An animated GIF of a live resection: arms, and the organ as it is followed, groove, flap and
+    all; dark beneath it the truth, where the source knows it.
+
+    Attributes:
+        every_s: at least so long from one picture to the next.
+    """
+
+    target: ClassVar[str] = "path"
+
+    path: Path
+    every_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check_name(self.path)
+        self.check_between("film:", every_s=(0.03, 3600))
+
+    def open(self, context: SinkContext) -> FilmSink:
+        check_place(self.path, "", None)
+        return FilmSink(self, str(context.patient))
+
+
+class FilmSink:
+    """Written when it is closed."""
+
+    def __init__(self, config: FilmSinkConfig, patient: str) -> None:
+        self._path, self._every_ns, self._patient = config.path, config.every_s * 1e9, patient
+        self._pictures, self._next_ns = list[Image.Image](), 0.0
+        self._boxes: tuple[np.ndarray, np.ndarray] | None = None
+        self._organ: Mesh | None = None  # the last that was known: what is shown from near
+
+    def publish(self, result: TrackingResult) -> None:
+        now, cell = result.transformed, result.control
+        self._organ = self._organ if now is None else next(iter(now.meshes.values()))
+        if self._organ is None or cell is None or result.stamp_ns < self._next_ns:
+            return
+        self._next_ns = result.stamp_ns + self._every_ns
+        self._boxes = self._boxes or _boxes(cell.shapes, self._organ)
+        bodies = [] if now is None else [
+            Body(mesh, name_colour(n) if is_tumor(n) else ORGAN_PART, 0.6 if is_tumor(n) else 0.42)
+            for n, mesh in now.meshes.items()
+        ]  # fmt: skip
+        if result.observation is not None and (truth := result.observation.truth) is not None:
+            pose = result.published_frame.published_from_camera
+            shown = [Body(mesh, TRUE, 1.0, pose) for mesh in truth.parts]
+            bodies += [shown[0]._replace(opacity=0.2), *shown[1:]]
+        words = f"{result.describe()}\n{cell.line}", [cell.stopped][: bool(cell.stopped)]
+        picture = cell.shapes, bodies, cell.lines, self._boxes, self._organ
+        self._pictures.append(_picture(*picture, (*words, [self._patient])))
+        if len(self._pictures) > _MOST:
+            self._pictures, self._every_ns = self._pictures[::2], 2 * self._every_ns
+
+    def close(self) -> None:
+        if self._pictures:
+            _write(self._pictures, self._path)
+        self._pictures = []
 
 
 def divided(located: Located, plan: ResectionPlan) -> tuple[list[Body], list[Body]]:

@@ -16,7 +16,6 @@ HaltKind = Literal[
     "no_plan", "defect", "interrupted", "aborted", "ended", "stopped", "slipped", "restless",
 ]  # fmt: skip
 _SENTENCES = read_table("tumortrack_resection", "halts.toml", dict[HaltKind, str])
-CUT_NOTE = "cut: estimates are of the intact organ"
 _WITHOUT_NUMBERS = str.maketrans("", "", "0123456789.")
 
 
@@ -27,27 +26,24 @@ class Aborted(TumortrackError):
 
 
 class Halt(msgspec.Struct, frozen=True):
-    """``finding``: of the estimate, where that is the reason. ``cut``: a new plan would help, but
-    cutting has begun, and the model knows the intact organ alone."""
+    """``finding``: of the estimate, where that is the reason."""
 
     kind: HaltKind
     values: Mapping[str, float | str] = {}
     finding: Finding | None = None
-    cut: bool = False
 
     @property
     def message(self) -> str:
-        words = _SENTENCES[self.kind].format(**self.values)
-        return f"{words} ({CUT_NOTE}; --replan-cut plans on them anyway)" if self.cut else words
+        return _SENTENCES[self.kind].format(**self.values)
 
     @property
     def words_without_numbers(self) -> str:
         return self.message.translate(_WITHOUT_NUMBERS)
 
     @property
-    def same_as(self) -> tuple[HaltKind, bool, object]:
+    def same_as(self) -> tuple[HaltKind, object]:
         """Equal for halts that differ in their numbers alone."""
         if self.finding is not None:
-            return self.kind, self.cut, self.finding.same_as
+            return self.kind, self.finding.same_as
         texts = tuple(value for value in self.values.values() if isinstance(value, str))
-        return self.kind, self.cut, texts
+        return self.kind, texts

@@ -79,13 +79,14 @@ class Motions:
 
 class Execution:
     """``step`` advances time; ``halt`` slows the arms down to a stop on their path, ``go``
-    resumes; ``abort`` is a halt for good. ``halted``: why the arms stand or slow down;
-    ``gripped_rad``: the joints at the end of hold."""
+    resumes; ``abort`` is a halt for good. ``pace``: share of the motions' speed. ``halted``: why
+    the arms stand or slow down; ``gripped_rad``: the joints at the end of hold."""
 
     def __init__(self, motions: Motions) -> None:
         self._motions = motions
         self._number, self._time_s = 0, 0.0
         self._speed = 0.0  # of the motions' own time, 0..1
+        self.pace = 1.0
         self.halted: Halt | None = None
         self.gripped_rad: Joints | None = None
         self._aborted = False
@@ -172,7 +173,7 @@ class Execution:
         while seconds > 0 and not self._over:
             change = min(seconds, 0.02)  # the speed changes in such small steps
             seconds -= change
-            target, before = 0.0 if self.halted else 1.0, self._speed
+            target, before = 0.0 if self.halted else self.pace, self._speed
             most = change / self._brake_s()
             self._speed += float(np.clip(target - before, -most, most))
             self._time_s += change * (before + self._speed) / 2

@@ -10,7 +10,6 @@ from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 from jaxtyping import Float64
 from scipy.spatial import cKDTree
@@ -21,13 +20,15 @@ from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.evidence import Evidence
-from tumortrack.core.geometry import Affine, transform_points
+from tumortrack.core.geometry import IDENTITY, Affine, transform_points
+from tumortrack.core.rigid_fit import kabsch
 from tumortrack.core.types import Mesh
 from tumortrack.live.values import Polyline, RigidShape, StopReason, TrackingResult
 from tumortrack_resection.budget import MOVED_MM, LiveBudget
 from tumortrack_resection.grip import Grip
-from tumortrack_resection.halt import CUT_NOTE, Halt
+from tumortrack_resection.halt import Halt
 from tumortrack_resection.motions import CUTTER, JOINTS, Execution, Joints, Motions, Stage
+from tumortrack_resection.swept import Swept
 from tumortrack_resection.values import ELECTRODE, Located, ResectionPlan
 from tumortrack_resection.workcell import TipOf, Workcell, stage_words
 
@@ -36,6 +37,7 @@ _COMPARED = 500  # points of surfaces with different triangles
 _ELECTRODE = f"{CUTTER}/{ELECTRODE}"  # drawn in a colour of its own while it is energised
 _SILENT_S = 0.2  # without an update for longer, the arms halt
 _RESTLESS_S = 10.0  # of waiting for what moved to lie still, before that is said
+_AGAIN_S = 5.0  # until it is planned again, where there was no plan for an organ that is cut
 
 
 class OperationConfig(Config, frozen=True, kw_only=True):
@@ -44,14 +46,12 @@ class OperationConfig(Config, frozen=True, kw_only=True):
     Attributes:
         moved_mm: of the tumor's surface, root mean square: then it counts as moved.
         settled_mm, settled_s: a new plan waits until it has moved no more than that for so long.
-        replan_cut: replan on the intact organ's model even after the first sweep has begun.
         speed: factor on the motions' speed.
     """
 
     moved_mm: float = MOVED_MM
     settled_mm: float = 0.7
     settled_s: float = 0.5
-    replan_cut: bool = False
     speed: float = 1.0
 
     def __post_init__(self) -> None:
@@ -100,9 +100,9 @@ ReachOf = Callable[[Mesh, Joints], Reach]
 class Following(NamedTuple):
     """What an operation that follows the organ needs. ``locate``: an update's estimate in the
     table's frame; None: estimates are ignored. ``replan``: begins a new plan in another process.
-    ``budget``: adds up the errors. ``grip``: what the holder holds, as evidence. ``reach``:
-    touches are advised where the arms can take them. ``tip_mm``: where their tools are. ``real``:
-    there are sinks of real arms, connected or not."""
+    ``budget``: adds up the errors. ``grip``, ``swept``: what the holder holds and what
+    is cut, as evidence. ``reach``: touches are advised where the arms can take them. ``tip_mm``:
+    where their tools are. ``real``: there are sinks of real arms, connected or not."""
 
     locate: Locate | None = None
     replan: Replan | None = None
@@ -111,6 +111,7 @@ class Following(NamedTuple):
     reach: ReachOf | None = None
     tip_mm: TipOf | None = None
     real: bool = False
+    swept: Swept | None = None
 
 
 _UNSEEING = Following()
@@ -127,7 +128,8 @@ class Operation:
         self.planned, self._config = planned, config
         self._warnings = planned.plan.warnings  # also of later plans: the budget stays accepted
         self._draw = draw
-        self._locate, self._replan, self._budget, self._grip, self._reach = live[:5]
+        self._locate, self._replan, self._budget, _, self._reach = live[:5]
+        self._knows = [each for each in (live.grip, live.swept) if each is not None]
         self.tip_mm, self._real = live.tip_mm, live.real
         self._execution = Execution(planned.motions)
         self._last_s: float | None = None
@@ -136,6 +138,7 @@ class Operation:
         self._off_s: float | None = None  # since when something lies elsewhere
         self._work: Future[Planned] | None = None
         self._cut = False  # whether the first sweep of any plan has begun
+        self._no_plan: tuple[Halt, float] | None = None  # for what is cut; and when it was sought
         self.static_shapes: tuple[RigidShape, ...] = ()
         self.log: list[dict[str, Any]] = []
         self.halts: Counter[str] = Counter()
@@ -155,8 +158,8 @@ class Operation:
         now_s = time.monotonic() if now_s is None else now_s
         self._advance(now_s)
         self._decide(update, now_s)
-        if self._grip is not None:
-            self._grip.update(self._execution, update)
+        for each in self._knows:
+            each.update(self._execution, update)
         if not self.log or self.log[-1]["state"] != self._execution.state:
             self._log(now_s)
         halt = self._execution.halted
@@ -187,8 +190,9 @@ class Operation:
         return estimate.assessed(next_evidence=worthwhile(advice))
 
     def evidence(self, camera_from_published: Affine, stamp_ns: int) -> tuple[Evidence, ...]:
-        """Where the holder has the tissue that it grips."""
-        return () if self._grip is None else self._grip.evidence(camera_from_published, stamp_ns)
+        """Where the holder has the tissue that it grips, and where the electrode cuts."""
+        told = (each.evidence(camera_from_published, stamp_ns) for each in self._knows)
+        return tuple(piece for pieces in told for piece in pieces)
 
     @property
     def halt(self) -> Halt | None:
@@ -216,6 +220,7 @@ class Operation:
         state = f"{execution.state} ({self._note})" if self._note else execution.state
         now = None if self._budget is None else self._budget.now
         halt, note = execution.halted, "" if now is None else now.left_words
+        note += f"; at {execution.pace:.0%} of the speed" if note and execution.pace < 1 else ""
         stopped = "" if halt is None else halt.message
         line = f"arms: {stage_words(state, self._real)}" + (f" ({stopped})" if stopped else "")
         return Workcell(
@@ -234,12 +239,9 @@ class Operation:
 
     @property
     def _note(self) -> str:
-        """Warnings on the plan, and on estimates of an organ that is being cut."""
-        heads = dict.fromkeys(
-            warning.split(":")[0].rstrip(".")
-            for warning in (*self._warnings, *self.planned.plan.warnings)
-        )
-        return "; ".join([*heads, *([CUT_NOTE] if self._cut and self._locate is not None else [])])
+        """Warnings on the plan."""
+        warnings = (*self._warnings, *self.planned.plan.warnings)
+        return "; ".join(dict.fromkeys(each.split(":")[0].rstrip(".") for each in warnings))
 
     def summary(self) -> dict[str, Any]:
         resection = {
@@ -271,7 +273,8 @@ class Operation:
             self._take_work(self._work, now_s)
         over = execution.ended or execution.state == Stage.ABORTED
         if self._locate is None or over or execution.sweep > self.planned.plan.sweeps:
-            execution.go()  # nothing to compare, nothing moves any more, or all is cut
+            execution.pace = 1.0  # nothing to compare, nothing moves any more, or all is cut
+            execution.go()
         elif update.estimate is None:
             self._halt_unsettled(Halt("no_estimate", {"message": update.reason}, update.finding))
         elif (halt := _slipped(update)) is not None:
@@ -301,16 +304,17 @@ class Operation:
         tumor = located.meshes[name]
         halt, plan_anew = self._reason_to_halt(update, located)
         if halt is None:
-            self._settled = self._off_s = None
+            self._settled = self._off_s = self._no_plan = None
             execution.go()
             if self._budget is not None:
+                execution.pace = self._budget.pace if execution.sweep else 1.0
                 self._budget.went_on()
             return
         if not plan_anew:
             self._halt_unsettled(halt)
             return
-        if self._cut and not config.replan_cut:
-            execution.halt(msgspec.structs.replace(halt, cut=True))
+        if self._no_plan is not None and now_s - self._no_plan[1] < _AGAIN_S:
+            self._halt_unsettled(self._no_plan[0])
             return
         execution.halt(self._after_a_while(halt, now_s))
         if self._settled is None or distance_mm(tumor, self._settled[0]) > config.settled_mm:
@@ -318,7 +322,7 @@ class Operation:
         elif now_s - self._settled[1] >= config.settled_s and execution.still:
             self._settled = self._off_s = None
             if self._replan is not None:
-                plan = self.planned.plan
+                plan = self.planned.plan.transformed(_moved(self.planned.meshes[name], tumor))
                 self._work = self._replan(update, execution.joints_rad, self.progress, plan)
 
     def _after_a_while(self, halt: Halt, now_s: float) -> Halt:
@@ -352,7 +356,8 @@ class Operation:
         return over_budget
 
     def _take_work(self, work: Future[Planned], now_s: float) -> None:
-        """Take over the new plan once it is ready; stop for good if planning failed."""
+        """Take over the new plan once it is ready; stop for good if planning failed, but of an
+        organ that is cut seek one again, as it moves on."""
         execution = self._execution
         if execution.state == Stage.ABORTED:
             self._work = None
@@ -367,7 +372,9 @@ class Operation:
             execution.replace(self.planned.motions)
             self._log(now_s, event="planned anew")
         elif isinstance(failure, TumortrackError):
-            execution.abort(Halt("no_plan", {"message": str(failure)}))
+            halt = Halt("no_plan", {"message": str(failure)})
+            self._no_plan = halt, now_s
+            execution.halt(halt) if self._cut else execution.abort(halt)
         else:  # a defect of the planner must stop the arms, and be reported
             words = f"{type(failure).__name__}: {failure}"
             execution.abort(Halt("defect", {"message": words}))
@@ -386,15 +393,21 @@ def _slipped(update: TrackingResult) -> Halt | None:
     return None
 
 
-def distance_mm(a: Mesh, b: Mesh) -> float:
+def distance_mm(now: Mesh, before: Mesh) -> float:
     """How far a surface has moved, root mean square: of its vertices if the triangles are the
-    same, else between the surfaces."""
-    return float(np.sqrt((_distances_mm(a, b) ** 2).mean()))
+    same, else from what there was to what there is: the walls of a new cut have not moved."""
+    return float(np.sqrt((_distances_mm(now, before) ** 2).mean()))
 
 
-def _distances_mm(a: Mesh, b: Mesh) -> Float64[np.ndarray, " n"]:
-    if np.array_equal(a.faces, b.faces):
-        return np.sqrt(((a.vertices_mm - b.vertices_mm) ** 2).sum(axis=1))
-    pairs = (a.vertices_mm, b.vertices_mm), (b.vertices_mm, a.vertices_mm)
-    apart = [cKDTree(to).query(of[:: max(1, len(of) // _COMPARED)])[0] for of, to in pairs]
-    return np.concatenate(apart)
+def _distances_mm(now: Mesh, before: Mesh) -> Float64[np.ndarray, " n"]:
+    if np.array_equal(now.faces, before.faces):
+        return np.sqrt(((now.vertices_mm - before.vertices_mm) ** 2).sum(axis=1))
+    of = before.vertices_mm[:: max(1, len(before.vertices_mm) // _COMPARED)]
+    return np.asarray(cKDTree(now.vertices_mm).query(of)[0])
+
+
+def _moved(before: Mesh, now: Mesh) -> Affine:
+    """How a tumor has moved, as far as it moved rigidly; not at all, where nobody knows."""
+    if not np.array_equal(now.faces, before.faces):
+        return IDENTITY
+    return kabsch(before.vertices_mm, now.vertices_mm, np.ones(len(now.vertices_mm)))

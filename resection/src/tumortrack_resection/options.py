@@ -72,9 +72,8 @@ class ResectOptions(CameraOptions):
 
     Attributes:
         live: MODEL SOURCE: follow the organ meanwhile, as `track` does. The arms halt while there
-            is no good estimate, and the plan is made again once the tumor has moved.
-        replan_cut: plan again even after the first sweep has begun, though the model knows only the
-            intact organ; otherwise the arms halt instead.
+            is no good estimate, and the plan is made again once the tumor has moved, also of an
+            organ that is cut.
         speed: of the arms; 2 is twice as fast as planned.
         moved: the tumor counts as moved once its surface is so many mm from where it was planned
             (root mean square; default: what the plan allows for).
@@ -82,7 +81,6 @@ class ResectOptions(CameraOptions):
     """
 
     live: tuple[Path, str] | None = None
-    replan_cut: bool = False
     speed: float = 1.0
     moved: float | None = None
     report: Path | None = None

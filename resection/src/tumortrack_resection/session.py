@@ -44,7 +44,7 @@ from tumortrack.tracking.options import CameraOptions, model_folder, options_fro
 from tumortrack_devices.sources.virtual import VirtualSourceConfig
 from tumortrack_devices.viewer.scene import bare_faces
 from tumortrack_resection.budget import LiveBudget, tightest
-from tumortrack_resection.check import checked
+from tumortrack_resection.check import checked, electrode_line
 from tumortrack_resection.files import INVENTED, PlanFolder, read_plan
 from tumortrack_resection.grip import Grip, held_std_mm
 from tumortrack_resection.located import of_estimate
@@ -58,6 +58,7 @@ from tumortrack_resection.operation import (
 )
 from tumortrack_resection.options import ResectOptions
 from tumortrack_resection.planning import check_arms_installed
+from tumortrack_resection.swept import Swept
 from tumortrack_resection.ur_sink import UrSinkConfig
 from tumortrack_resection.values import POOR_ESTIMATE, Located, ResectionPlan
 
@@ -144,7 +145,7 @@ class ResectionSession:
     @contextmanager
     def following(self) -> Iterator[Session]:
         """A live session that compares every estimate with the plan, and replans where the tumor
-        has moved. InputError: no ``live`` source was given."""
+        has moved. InputError: no ``live`` source was given, or its model can't know what is cut."""
         from tumortrack_resection.arms import procedure
         from tumortrack_resection.arms.body import cell_urdf
         from tumortrack_resection.arms.cell import ArmsReach, tip_places
@@ -184,7 +185,10 @@ class ResectionSession:
             budget = LiveBudget(stored.budgets, late_s)
             reach, tip_mm = partial(ArmsReach, cell.config), tip_places(cell.config)
             grip = Grip(tip_mm, held_std_mm(stored.budgets[0]))
-            following = Following(locate, replan, budget, grip, reach, tip_mm, bool(self.arms))
+            line_mm = electrode_line(cell_urdf(cell.config))
+            swept = Swept(line_mm, cell.config.tools.radius_mm, stored.budgets[0])
+            real = bool(self.arms)
+            following = Following(locate, replan, budget, grip, reach, tip_mm, real, swept)
             self.operation = self._operation(stored.plan, self._config, following)
             source = live.source
             if isinstance(source, VirtualSourceConfig) and source.pulled is not None:
@@ -195,6 +199,10 @@ class ResectionSession:
             session = api.session(
                 live.model, live.source_text, self._given_sinks, self.operation, setup, **options
             )
+            if session.tracker.anatomy_ct is None:  # what is cut would stay unknown
+                raise InputError(
+                    f"live: {live.model} knows no motion, so nothing of cuts. Give the case itself."
+                )
             session.about["plan_config"] = to_builtins(self._config)
             yield session
 
@@ -272,7 +280,7 @@ def begin_resection(
         plan: folder that `tumortrack plan` wrote.
         sinks: as on the command line (``"viewer"``, ...), or their configurations. A real arm
             needs all that the command needs, and a person who confirms it at the terminal.
-        given: as on the command line: ``live``, ``replan_cut``, ``speed``, ``moved``, ``report``
+        given: as on the command line: ``live``, ``speed``, ``moved``, ``report``
             (default: none is written), ``range``, ``box``, ``whole``, ``intrinsics``, ``device``,
             ``patient``, ``side``.
 
@@ -295,7 +303,7 @@ def begin_resection(
         raise ArtifactError(f"{plan} lacks {lacking}'s surface. Plan again.")
     moving = [arm for arm in _real_arms(sinks) if arm.execute]  # reports wrong sinks early
     moved_mm = stored.budgets[0].motion_mm if options.moved is None else options.moved
-    config = OperationConfig(speed=options.speed, moved_mm=moved_mm, replan_cut=options.replan_cut)
+    config = OperationConfig(speed=options.speed, moved_mm=moved_mm)
     live = None if options.live is None else _live_of(*options.live, stored)
     cell, stored = _checked(plan, motions, stored.cell, stored)
     if moving:

@@ -210,6 +210,22 @@ class ResectionPlan:
     notes: tuple[str, ...] = ()
     clearances: tuple[Clearance, ...] = ()
 
+    def transformed(self, b_from_a: Float[np.ndarray, "4 4"]) -> ResectionPlan:
+        """Facets, cuts and grasp where a tumor that moved rigidly has taken them."""
+        turn, shift = b_from_a[:3, :3], b_from_a[:3, 3]
+        normals = self.facets[:, :3] @ turn.T
+        cuts = tuple(
+            replace(
+                cut, path_mm=transform_points(b_from_a, cut.path_mm),
+                axis=None if cut.axis is None else turn @ cut.axis,
+            )
+            for cut in self.cuts
+        )  # fmt: skip
+        return replace(
+            self, facets=np.column_stack([normals, self.facets[:, 3] + normals @ shift]), cuts=cuts,
+            grasp_mm=turn @ self.grasp_mm + shift, lift=turn @ self.lift,
+        )  # fmt: skip
+
     @property
     def warnings(self) -> tuple[str, ...]:
         """Notes that say not to rely on the plan."""

@@ -127,13 +127,11 @@ def error_covariance_mm2(points_ct: Float[np.ndarray, "n 3"]) -> Float64[np.ndar
 
 @dataclass(frozen=True, eq=False)
 class CutOrgan:
-    """What was cut (``registration.flap``): places of it in the CT, mm, and how wide; the deviation
-    of a shift of all of them, as where an electrode is errs; the names of the tumors with a flap,
-    and places all over each (CT, mm); the organ before."""
+    """What was cut (``registration.flap``): places of it in the CT, mm, and how wide; the names of
+    the tumors with a flap, and places all over each (CT, mm); the organ before."""
 
     points_ct: Float64[np.ndarray, "n 3"]
     kerf_mm: float
-    shared_mm: float
     flaps: dict[str, Float64[np.ndarray, "k 3"]]
     intact: RestShape
 

@@ -56,7 +56,7 @@ def lattice(surface: Mesh, edge_mm: float) -> TetMesh:
     tets = tets[contains(surface, nodes_mm[tets].mean(1))]
     if len(tets) == 0:
         raise InputError("the surface encloses nothing that tetrahedra could fill; repair it.")
-    tets = _largest_piece(tets)
+    tets = largest_piece(tets)
     used, tets = np.unique(tets, return_inverse=True)
     nodes_mm, tets = nodes_mm[used], tets.reshape(-1, 4).astype(np.int32)
     turned = tet_volumes(nodes_mm, tets) < 0
@@ -91,7 +91,7 @@ def _cubic(box_mm: np.ndarray, edge_mm: float) -> tuple[np.ndarray, np.ndarray]:
     return origin + edge_mm * nodes, np.concatenate(tets)
 
 
-def _largest_piece(tets: np.ndarray) -> np.ndarray:
+def largest_piece(tets: np.ndarray) -> np.ndarray:
     """The tetrahedra that hang together by nodes, of the piece with most of them."""
     links = np.repeat(tets[:, 0], 3), tets[:, 1:].ravel()
     size = tets.max() + 1

@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import msgspec
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float, Float64
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -25,7 +25,6 @@ from tumortrack.case.surface import largest_shell
 from tumortrack.core.cloud import FEWEST_POINTS
 from tumortrack.core.errors import InputError
 from tumortrack.core.evidence import Cut
-from tumortrack.core.process import parallel_map
 from tumortrack.core.report import CutReport
 from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Mesh
@@ -35,7 +34,7 @@ from tumortrack.organ.modes import RigidMotions, compliance_modes, patches_of
 from tumortrack.organ.rest_shape import FLAP_MODES, CutOrgan, DistanceField, RestShape
 from tumortrack.registration.compliance import RefinedFit
 from tumortrack.registration.config import GaussNewtonConfig
-from tumortrack.registration.gauss_newton import FARTHEST, RegistrationResult, refine
+from tumortrack.registration.gauss_newton import FARTHEST, refine
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.multi_view import MultiViewCloud
 from tumortrack.registration.search import far_from
@@ -53,7 +52,6 @@ _NEAR_STEPS = 1.5  # from the last place of a cut, in its places' distances, it 
 _LOAD_MN, _TISSUE_KPA = 2000.0, 15.0
 _MOST_MM = 8.0  # of a flap's motion, one deviation, however little holds it
 _BESIDE_MM = 10.0  # of a cut: there its flap and its bed are seen
-_SHIFTED = (1.0, 0.5, 0.5, 0.25)  # deviations: of a cut's shift, what is tried in turn
 _MINE = 0.2  # of a cut's places that are nearest to a tumor: less was not cut for it
 _RESTS, _REST_STEPS = 2, 8  # of places of the rest from which fits start; of the way there
 _LIFTED_MM = 12.0  # from where a flap was: points so near may be its
@@ -83,7 +81,7 @@ def cut_shape(shape: RestShape, cuts: Sequence[Cut], poisson: float) -> RestShap
         mine, covariance = _modes_of(solid, factor, flap)
         modes.append(solid.spread(mine).astype(np.float32))
         states.append(covariance)
-    kerf_mm, shared_mm = np.max([(c.kerf_mm, c.shared_std_mm) for c in cuts], axis=0).tolist()
+    kerf_mm = max(cut.kerf_mm for cut in cuts)
     kerf = _kerf(shape.distances[0], points_ct, kerf_mm)
     field, organ = _grooved(shape.distances[0], kerf), _without(shape.anatomy_ct.organ, kerf)
     patches = patches_of(shape.anatomy_ct.organ, 600, np.random.default_rng(0))
@@ -97,9 +95,7 @@ def cut_shape(shape: RestShape, cuts: Sequence[Cut], poisson: float) -> RestShap
     )
     anatomy = replace(shape.anatomy_ct, parts=(organ, *shape.anatomy_ct.tumors))
     distances = (field, *shape.distances[1:])
-    return RestShape(
-        anatomy, new, distances, CutOrgan(points_ct, kerf_mm, shared_mm, places, shape)
-    )
+    return RestShape(anatomy, new, distances, CutOrgan(points_ct, kerf_mm, places, shape))
 
 
 def carried_over(motion: ElasticMotion, shape: RestShape) -> ElasticMotion:
@@ -124,9 +120,7 @@ def flap_starts(
     for start in starts:
         if (cut := start.shape.cut) is None or not cut.flaps:
             return []
-        flaps = cKDTree(np.concatenate(list(cut.flaps.values())))
-        away_mm = flaps.query(start.inverse(views.points_mm), distance_upper_bound=_LIFTED_MM)[0]
-        rest = np.flatnonzero(away_mm == np.inf)
+        rest = np.flatnonzero(_away_of_flaps_mm(start, views.points_mm) == np.inf)
         if len(rest) < FEWEST_POINTS or len(rests) == _RESTS:
             continue
         some = replace(views, points_mm=views.points_mm[rest], view=views.view[rest])
@@ -134,6 +128,30 @@ def flap_starts(
         if far_from(motion, rests):
             rests.append(motion)
     return [moved for motion in rests for moved in (motion, *_with_flaps_moved(motion))]
+
+
+def with_points_of_flaps(motion: ElasticMotion, views: MultiViewCloud) -> MultiViewCloud:
+    """With those of the candidates that lie so near to where flaps would be that they may be
+    theirs; the views themselves, if there are none."""
+    cut, candidates_mm = motion.shape.cut, views.candidates_mm
+    if cut is None or not cut.flaps or candidates_mm is None or not len(candidates_mm):
+        return views
+    near = np.isfinite(_away_of_flaps_mm(motion, candidates_mm))
+    if not near.any():
+        return views
+    points_mm = np.concatenate([views.points_mm, candidates_mm[near]])
+    view = np.append(views.view, np.zeros(int(near.sum()), int))
+    return replace(views, points_mm=points_mm, view=view, candidates_mm=candidates_mm[~near])
+
+
+def _away_of_flaps_mm(
+    motion: ElasticMotion, points_mm: Float[np.ndarray, "n 3"]
+) -> Float64[np.ndarray, " n"]:
+    """How far points (camera frame) lie from where flaps were; infinite where they cannot be
+    theirs."""
+    assert motion.shape.cut is not None
+    flaps = cKDTree(np.concatenate(list(motion.shape.cut.flaps.values())))
+    return flaps.query(motion.inverse(points_mm), distance_upper_bound=_LIFTED_MM)[0]
 
 
 def _with_flaps_moved(motion: ElasticMotion) -> Iterator[ElasticMotion]:
@@ -146,34 +164,6 @@ def _with_flaps_moved(motion: ElasticMotion) -> Iterator[ElasticMotion]:
             coefficients = motion.coefficients.copy()
             coefficients[flap] = way
             yield replace(motion, coefficients=coefficients)
-
-
-def with_shift(fit: RegistrationResult, config: GaussNewtonConfig) -> Cut | None:
-    """What was cut, shifted as fits the points best: where an electrode is errs by its calibration.
-    By trials, each with half the step of the one before. None: not at all."""
-    shape, shift = fit.motion.shape, np.zeros(3)
-    if (cut := shape.cut) is None or cut.shared_mm <= 0:
-        return None
-    near = msgspec.structs.replace(config, first_mm=config.last_mm)
-
-    def cost(shift_mm: Float64[np.ndarray, " 3"]) -> float:
-        kerf = _kerf(cut.intact.distances[0], cut.points_ct + shift_mm, cut.kerf_mm)
-        moved = replace(
-            shape, distances=(_grooved(cut.intact.distances[0], kerf), *shape.distances[1:])
-        )
-        again = refine(moved, fit.views, fit.motion, near)
-        return again.cost + float(shift_mm @ shift_mm) / cut.shared_mm**2
-
-    least = cost(shift)
-    for step_mm in cut.shared_mm * np.array(_SHIFTED):
-        ways = [shift + sign * step_mm * axis for axis in np.eye(3) for sign in (-1, 1)]
-        costs = parallel_map(cost, ways)
-        if min(costs) < least:
-            least, shift = min(costs), ways[int(np.argmin(costs))]
-    if not shift.any():
-        return None
-    places = tuple(map(tuple, (cut.points_ct + shift).tolist()))
-    return Cut(points_ct=places, kerf_mm=cut.kerf_mm)
 
 
 def lattice_of(body: ElasticBody) -> ElementLattice:
@@ -231,7 +221,7 @@ def _flaps(
     tumors = shape.anatomy_ct.tumors
     away_mm = [cKDTree(part.vertices_mm).query(points_ct)[0] for part in tumors]
     owner = np.argmin(away_mm, axis=0) if tumors else np.zeros(0, int)
-    for number in np.flatnonzero(np.bincount(owner) >= _MINE * len(owner)):
+    for number in np.flatnonzero(np.bincount(owner) >= _MINE * len(owner)).tolist():
         off_mm = cKDTree(tumors[number].vertices_mm).query(middles)[0]
         off_mm[shape.distances_mm(middles, number + 1) < 0] = 0.0
         inside = (solid.organ > 0) & ~crossed & (off_mm < away_mm[number][nearest])

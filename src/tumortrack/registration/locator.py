@@ -19,7 +19,7 @@ from tumortrack.core.ultrasound import ProbeRecording
 from tumortrack.registration.compliance import RefinedFit
 from tumortrack.registration.estimate import EstimateMaker, Found
 from tumortrack.registration.evidence import EvidenceTerms, TrackedEvidence, propagate
-from tumortrack.registration.flap import carried_over, with_shift
+from tumortrack.registration.flap import carried_over
 from tumortrack.registration.frame import Frame
 from tumortrack.registration.gauss_newton import RegistrationResult, prior_precision
 from tumortrack.registration.model import RegistrationModel
@@ -57,9 +57,6 @@ class RegistrationLocator:
     ) -> Estimate:
         """See ``tracking.tracker.Tracker.locate``."""
         frame, fit, method = self._registered(views, seed, evidence, any_pose)
-        if (cut := with_shift(fit, method.config)) is not None:
-            shifted = RegistrationLocator(self._model.with_cut([cut]))
-            return shifted.locate(views, grid, seed, evidence, any_pose)
         found = self._found(fit, method.prior, tuple(evidence))
         return self._maker.estimate(frame, views, found, self._refined(fit, frame), grid=grid)
 

@@ -34,7 +34,7 @@ from tumortrack.core.process import parallel_map
 from tumortrack.organ.rest_shape import RestShape
 from tumortrack.registration.compliance import RefinedFit, refine_compliance
 from tumortrack.registration.config import GaussNewtonConfig
-from tumortrack.registration.flap import flap_starts
+from tumortrack.registration.flap import flap_starts, with_points_of_flaps
 from tumortrack.registration.gauss_newton import (
     FARTHEST,
     GaussNewton,
@@ -104,7 +104,7 @@ class Registration:
         with timed("refine"):
             best = self.best_fit(views, starts, known)
             if views.count == 1:
-                return self.with_all_points(best, views)
+                return self.with_all_points(*self._with_flap(best, views))
             fits = [self._correct_cameras(views, fit) for fit in (best, *best.others)]
             return select_best(fits if known is None else [known, *fits], self.prior)
 
@@ -127,6 +127,18 @@ class Registration:
             parallel_map(lambda descent: descent.run(near.steps), fits)
             fit = select_best([descent.result() for descent in fits], self.prior)
         return fit
+
+    def _with_flap(
+        self, fit: RegistrationResult, views: MultiViewCloud
+    ) -> tuple[RegistrationResult, MultiViewCloud]:
+        """Of an organ that was cut: a flap that was lifted is a piece of its own in the image, so
+        the points near where it was are fitted, too; the fit, and the views with these."""
+        more = with_points_of_flaps(fit.motion, views)
+        if more is views:
+            return fit, views
+        starts = [Start(motion) for motion in flap_starts(more, [fit.motion], self.config)]
+        fits = self._fit_promising(more, [Start(fit.motion, fit.pose_offset), *starts], ())
+        return select_best(fits, self.prior), more
 
     def follow(
         self, views: MultiViewCloud, start: ElasticMotion, config: GaussNewtonConfig

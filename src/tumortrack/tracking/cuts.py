@@ -33,12 +33,10 @@ _EVERY_NS, _RESTED_NS = 3_000_000_000, 500_000_000  # a tracker is made so often
 
 @dataclass
 class _OfTool:
-    """Of one tool: a place in each cube, and the largest of what its cuts state."""
+    """Of one tool: a place in each cube, and the widest of its kerfs."""
 
     places_ct: dict[Any, Point] = field(default_factory=dict)
     kerf_mm: float = 0.0
-    std_mm: float = 0.0
-    shared_std_mm: float = 0.0
 
 
 class Cuts:
@@ -58,8 +56,7 @@ class Cuts:
         shape = tracker.model.shape if isinstance(tracker.model, RegistrationModel) else None
         if shape is not None and (cut := shape.cut) is not None:
             before = tuple(map(tuple, cut.points_ct.tolist()))
-            known = Cut(points_ct=before, kerf_mm=cut.kerf_mm, shared_std_mm=cut.shared_mm)
-            self._keep(known, cut.points_ct, 0)
+            self._keep(Cut(points_ct=before, kerf_mm=cut.kerf_mm), cut.points_ct, 0)
             self._in_use = self._asked = self.known
 
     @property
@@ -162,8 +159,7 @@ class Cuts:
         if not len(points_ct):
             return
         tool, before, self._told = self._tools.setdefault(cut.tool, _OfTool()), self.known, False
-        for name in ("kerf_mm", "std_mm", "shared_std_mm"):
-            setattr(tool, name, max(getattr(cut, name), getattr(tool, name)))
+        tool.kerf_mm = max(cut.kerf_mm, tool.kerf_mm)
         cubes = map(tuple, np.floor(points_ct / _APART_MM).astype(int).tolist())
         for cube, point in zip(cubes, map(tuple, points_ct.tolist()), strict=True):
             tool.places_ct.setdefault(cube, point)
@@ -175,13 +171,7 @@ class Cuts:
     def all(self) -> tuple[Cut, ...]:
         """What is known, of each tool, in places of the CT."""
         return tuple(
-            Cut(
-                points_ct=tuple(of.places_ct.values()),
-                kerf_mm=of.kerf_mm,
-                std_mm=of.std_mm,
-                shared_std_mm=of.shared_std_mm,
-                tool=tool,
-            )
+            Cut(points_ct=tuple(of.places_ct.values()), kerf_mm=of.kerf_mm, tool=tool)
             for tool, of in self._tools.items()
         )
 

@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from tumortrack.assessment.bound import POOR_MM
 from tumortrack.assessment.sight import log_likelihood
 from tumortrack.core.assessment import deciding
@@ -14,6 +16,7 @@ from tumortrack.core.estimate import Estimate
 from tumortrack.core.types import DepthFrame, View
 
 _UNDETERMINED = 2.0  # times the radius that makes an answer poor
+_BESIDE_MM, _SAME_MM = 15.0, 2.0  # from a flap to its rest; from a point to others of its piece
 _ELSEWHERE = "fit", "outliers", "seen_through", "size"  # checks that speak for another piece
 
 
@@ -52,6 +55,34 @@ def select_piece(
         total_s = timings["total"] + other_s
         estimate = estimate.reporting(timings={**timings, "pieces": other_s, "total": total_s})
     return estimate, tried
+
+
+def with_flap_joined(view: View) -> View:
+    """Of an organ that was cut: where pieces of the image lie beside the likeliest, they may be one
+    organ, a flap and the rest; all of them together are tried first."""
+    from scipy.spatial import cKDTree
+
+    cloud = view.cloud
+    if not cloud.others or not len(cloud.candidates_mm):
+        return view
+    mine = cKDTree(cloud.points_mm)
+    beside = [
+        other.points_mm
+        for other in cloud.others
+        if mine.query(other.points_mm, distance_upper_bound=_BESIDE_MM)[0].min() < np.inf
+    ]
+    if not beside:
+        return view
+    away_mm = cKDTree(np.concatenate(beside)).query(cloud.candidates_mm)[0]
+    near = away_mm < _SAME_MM  # candidates are as dense as points
+    joined = replace(
+        cloud,
+        points_mm=np.concatenate([cloud.points_mm, cloud.candidates_mm[near]]),
+        candidates_mm=cloud.candidates_mm[~near],
+        others=(replace(cloud, others=()), *cloud.others),
+    )
+    alone = view.full_view is cloud
+    return replace(view, cloud=joined, full_view=joined if alone else view.full_view)
 
 
 def _doubted(estimate: Estimate) -> bool:

@@ -37,7 +37,7 @@ from tumortrack.registration.probe import UNKNOWN, believed
 from tumortrack.segmentation import RegionConfig
 from tumortrack.segmentation.smoothing import clean_cloud
 from tumortrack.tracking.model_files import case_model
-from tumortrack.tracking.pieces import select_piece
+from tumortrack.tracking.pieces import select_piece, with_flap_joined
 
 _DEFAULTS = FollowOptions()
 _BEFORE_MM = np.array([0.0, 0.0, 300.0])  # of a camera that there is not
@@ -160,6 +160,7 @@ class Tracker:
         shown, given = tuple[Evidence, ...](), pieces
         if not len(cloud.points_mm) and pieces:
             all_views, shown, pieces = _alone(cloud, pieces, self.model.parts[0])
+        all_views = self._with_flap_joined(all_views)
 
         def located(all_views: Sequence[View]) -> Estimate:
             found = self._locator.locate(all_views, grid, seed, pieces, any_pose)
@@ -217,6 +218,7 @@ class Tracker:
         strictly = how.allow_flip if last is None else last.quality != "good" or not _unusual(last)
         all_views: Sequence[View]
         all_views, (pieces, _) = _views_of(cloud, full_view, views), _evidence_of(evidence, False)
+        all_views = self._with_flap_joined(all_views)
         if pieces:
             how = msgspec.structs.replace(how, evidence=(*how.evidence, *pieces))
 
@@ -228,6 +230,12 @@ class Tracker:
             estimate, all_views = select_piece(all_views, located, most=1)  # a frame may not wait
         advise: Advise = "touches" if how.global_search else "nothing"
         return assessed(estimate, all_views, self.model, how.known, advise, self._advised)
+
+    def _with_flap_joined(self, all_views: Sequence[View]) -> Sequence[View]:
+        model = self.model
+        if not isinstance(model, RegistrationModel) or model.shape.cut is None:
+            return all_views
+        return [with_flap_joined(all_views[0]), *all_views[1:]]
 
     @contextmanager
     def _explaining_errors(

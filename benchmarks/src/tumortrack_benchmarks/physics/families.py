@@ -178,6 +178,7 @@ def _roll(stage: Stage, rng: Generator) -> Load:
 def _cut(stage: Stage, rng: Generator) -> Load:
     """The lips of the slit are pulled apart, the farther the nearer to its middle."""
     assert stage.wound is not None
+    assert stage.wound.slit is not None
     (middle, normal, radius), organ = stage.wound.slit, stage.organ
     far = np.linalg.norm(organ.points_mm - middle, axis=1) / radius
     lips = np.flatnonzero((far < 0.7) & (np.abs((organ.points_mm - middle) @ normal) < 8.0))

@@ -53,7 +53,7 @@ def rows_of(
     return csr_matrix((weights.ravel(), (row, nodes.ravel())), (len(nodes), n_nodes))
 
 
-def _spread(rows: csr_matrix, blocks: Float64[np.ndarray, "m 3 3"]) -> csr_matrix:
+def spread(rows: csr_matrix, blocks: Float64[np.ndarray, "m 3 3"]) -> csr_matrix:
     """The nodes' Hessian of those of single points."""
     m, n = rows.shape
     if m == 0:
@@ -110,7 +110,7 @@ class Touch:
             _, upright, limit = (part[hit] for part in self._last)
             flat = np.eye(3) - upright[:, :, None] * upright[:, None]
             blocks = blocks + (limit / _STICK_MM)[:, None, None] * flat
-        return _spread(self.rows[hit], blocks)
+        return spread(self.rows[hit], blocks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +127,7 @@ class Springs:
         return float((force * off).sum()) / 2, self.rows.T @ force
 
     def stiffness(self, nodes_mm: Nodes) -> csr_matrix:
-        return _spread(self.rows, self.springs_mn_mm[:, None, None] * np.eye(3))
+        return spread(self.rows, self.springs_mn_mm[:, None, None] * np.eye(3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +167,7 @@ class Capsule:
         e, row = len(self.edges), np.arange(len(self.edges))
         ends = np.repeat([-1.0, 1.0], e), (np.tile(row, 2), self.edges.T.ravel())
         rows = csr_matrix(ends, (e, len(nodes_mm)))
-        return _spread(rows, self.springs_mn_mm * way[:, :, None] * way[:, None])
+        return spread(rows, self.springs_mn_mm * way[:, :, None] * way[:, None])
 
 
 class _Soft:

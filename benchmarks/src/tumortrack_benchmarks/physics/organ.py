@@ -6,6 +6,7 @@ x, its middle at x = y = 0.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -40,33 +41,48 @@ class Slit(NamedTuple):
 
 
 class Wound(NamedTuple):
-    """A mesh with a slit: ``side`` of each tetrahedron (True: where the normal points), and the
-    ``walls``: triangles of nodes that were inside and now face the gap, turned outward."""
+    """A mesh that is parted: ``side`` of each tetrahedron (True: where the normal points), and the
+    ``walls``: triangles of nodes that were inside and now face the gap, turned outward, those of
+    one side before their like on the other."""
 
     mesh: TetMesh
     side: Bool[np.ndarray, " t"]
     walls: Int[np.ndarray, "w 3"]
-    slit: Slit
+    slit: Slit | None = None
 
 
 def cut_open(mesh: TetMesh, slit: Slit) -> Wound:
-    """Part the mesh: nodes that lie inside the slit are doubled. Raises InputError: the slit meets
-    no face between tetrahedra."""
-    middles = mesh.nodes_mm[mesh.tets].mean(1)
-    side = (middles - slit.middle_mm) @ slit.normal > 0
+    """Part the mesh within a slit. Raises InputError: it meets no face between tetrahedra."""
+    side = (mesh.nodes_mm[mesh.tets].mean(1) - slit.middle_mm) @ slit.normal > 0
+
+    def within(corners_mm: np.ndarray) -> Bool[np.ndarray, " f"]:
+        return np.linalg.norm(corners_mm.mean(1) - slit.middle_mm, axis=1) < slit.radius_mm
+
+    wound = parted(mesh, side, within)._replace(slit=slit)
+    if not len(wound.walls):
+        raise InputError("the slit meets no face between tetrahedra; make it larger.")
+    return wound
+
+
+def parted(
+    mesh: TetMesh,
+    side: Bool[np.ndarray, " t"],
+    within: Callable[[Float64[np.ndarray, "f 3 3"]], Bool[np.ndarray, " f"]],
+) -> Wound:
+    """Part the mesh at those faces between its sides that are ``within``, by their corners: nodes
+    inside are doubled."""
     faces = mesh.tets[:, FACES].reshape(-1, 3)
     owner = np.repeat(np.arange(len(mesh.tets)), 4)
     _, pair = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True)
     order = np.argsort(pair, kind="stable")
     twice = np.flatnonzero(np.diff(pair[order]) == 0)
     first, second = order[twice], order[twice + 1]
-    near = np.linalg.norm(mesh.nodes_mm[faces[first]].mean(1) - slit.middle_mm, axis=1)
-    parted = (side[owner[first]] != side[owner[second]]) & (near < slit.radius_mm)
-    if not parted.any():
-        raise InputError("the slit meets no face between tetrahedra; make it larger.")
+    between = np.flatnonzero(side[owner[first]] != side[owner[second]])
+    opens = np.zeros(len(first), bool)
+    opens[between] = within(mesh.nodes_mm[faces[first[between]]])
     # A corner is one node's in one tetrahedron; whole faces sew the corners of two together.
     tets, corner = mesh.tets, np.arange(mesh.tets.size).reshape(-1, 4)
-    a, b = owner[first[~parted]], owner[second[~parted]]
+    a, b = owner[first[~opens]], owner[second[~opens]]
     which, i, j = np.nonzero(tets[a][:, :, None] == tets[b][:, None])
     links = corner[a[which], i], corner[b[which], j]
     graph = coo_matrix((np.ones(len(which), bool), links), (tets.size, tets.size))
@@ -75,8 +91,12 @@ def cut_open(mesh: TetMesh, slit: Slit) -> Wound:
     nodes_mm[node] = mesh.nodes_mm[tets.ravel()]
     parted_tets = node.reshape(-1, 4).astype(np.int32)
     new = parted_tets[:, FACES].reshape(-1, 3)
-    walls = new[np.concatenate([first[parted], second[parted]])]
-    return Wound(TetMesh(nodes_mm, parted_tets), side, walls, slit)
+    turned = side[owner[first[opens]]]
+    walls = (
+        np.where(turned, first[opens], second[opens]),
+        np.where(turned, second[opens], first[opens]),
+    )
+    return Wound(TetMesh(nodes_mm, parted_tets), side, new[np.concatenate(walls)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +115,7 @@ class Organ:
     @classmethod
     def from_anatomy(cls, anatomy: Anatomy, mesh: TetMesh, sample_mm: float = 3.0) -> Organ:
         """``sample_mm``: one point of contact per cube of this size."""
-        points, areas = _contact_points(anatomy.organ, sample_mm)
+        points, areas = contact_points(anatomy.organ, sample_mm)
         share = _tumor_share(mesh, anatomy) if anatomy.tumors else np.zeros(len(mesh.tets))
         held = find(mesh.nodes_mm[mesh.tets], points)
         return cls(anatomy, mesh, Bed.from_organ(anatomy.organ), share, points, areas, *held)
@@ -154,12 +174,12 @@ def transformed(anatomy: Anatomy, b_from_a: Float64[np.ndarray, "4 4"]) -> Anato
     )
 
 
-def _contact_points(organ: Mesh, cube_mm: float) -> tuple[Points, Float64[np.ndarray, " m"]]:
+def contact_points(organ: Mesh, cube_mm: float) -> tuple[Points, Float64[np.ndarray, " m"]]:
     """One point of the surface per cube that it passes, and the area there."""
     points_mm, areas_mm2 = surface_samples(organ, cube_mm / 2)
     cubes = np.floor(points_mm / cube_mm)
     _, first, cube = np.unique(cubes, axis=0, return_index=True, return_inverse=True)
-    return points_mm[first], np.bincount(cube.ravel(), areas_mm2)
+    return points_mm[first], np.bincount(cube.ravel(), areas_mm2).astype(np.float64)
 
 
 def _tumor_share(mesh: TetMesh, anatomy: Anatomy) -> Float64[np.ndarray, " t"]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import itertools
 import signal
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from copy import copy
 from typing import NamedTuple
 
@@ -80,7 +80,7 @@ def plan_motions(
     Args:
         located: the organ as it lies now, table frame, mm.
         start: where the arms are, if not at home.
-        like: an earlier plan with facets, which are kept.
+        like: an earlier plan with facets, which are kept; as it lies now.
         pieces: for so many motions are planned at most.
         drafts: of the same, if there are some already.
 
@@ -88,7 +88,9 @@ def plan_motions(
     """
     if start is not None:
         _check_start(start, cell)
-    drafts = drafts or Drafts(located, config, cell.tools, like)
+    from_sweep = None if start is None else start.from_sweep
+    done = None if like is None or from_sweep is None else from_sweep - 1
+    drafts = drafts or Drafts(located, config, cell.tools, like, done)
     reason: Blocked | None = None
     roomy = start is None and config.method == "margin"
     rooms_mm: tuple[float, ...] = (_ROOM_MM, 0.0) if roomy else (0.0,)
@@ -203,30 +205,22 @@ def _cut_and_finish(
     """From this sweep on; the instrument has gone home before the piece is lifted."""
     if first > len(draft.sweeps) + 1:
         raise InputError(f"from_sweep is {first}; there are {len(draft.sweeps)} sweeps.")
-    group, blocks = builder.group(CUTTER, (CUTTER, HOLDER)), dict[int, Blocked]()
-    ways: dict[int, list[Way]] = {}
-    for sweep, choices in enumerate(draft.sweeps, start=1):
-        if sweep >= first and not draft.level:
-            try:
-                ways[sweep] = cutting.ways(group, choices, outside)
-            except Blocked as blocked:
-                blocks[sweep] = blocked
-    if blocks:
-        raise FacetsBlocked(blocks)
+    made = {*range(1, first), *draft.through}
+    ways = {} if draft.level else _ways(builder, draft, outside, made)
     cuts: list[Cut] = []
     for sweep, choices in enumerate(draft.sweeps, start=1):
-        if sweep < first:
-            cuts.append(choices[0])
-            continue
         try:
-            if draft.level:
+            if sweep in made:
+                cuts.append(choices[0])
+            elif draft.level:
                 cuts += choices
                 cutting.cut_level(builder, choices[0], outside)
             else:
                 cuts.append(cutting.go_one_of(builder, ways[sweep]))
         except Blocked as blocked:
             raise FacetsBlocked({sweep: blocked}) from blocked
-        builder.close(f"sweep {sweep}")
+        if sweep >= first:
+            builder.close(f"sweep {sweep}")
     _go_home(builder, CUTTER, (HOLDER,))
     _rise(builder, draft.lift)
     builder.close(Stage.LIFT)
@@ -235,6 +229,23 @@ def _cut_and_finish(
     _go_home(builder, HOLDER, ())
     builder.close("home")
     return draft.plan(tuple(cuts)), Motions(builder.stages)
+
+
+def _ways(
+    builder: TrajectoryBuilder, draft: Draft, outside: Outside, made: Container[int]
+) -> dict[int, list[Way]]:
+    """Of each sweep that is not made. Raises FacetsBlocked."""
+    group, blocks = builder.group(CUTTER, (CUTTER, HOLDER)), dict[int, Blocked]()
+    ways: dict[int, list[Way]] = {}
+    for sweep, choices in enumerate(draft.sweeps, start=1):
+        if sweep not in made:
+            try:
+                ways[sweep] = cutting.ways(group, choices, outside)
+            except Blocked as blocked:
+                blocks[sweep] = blocked
+    if blocks:
+        raise FacetsBlocked(blocks)
+    return ways
 
 
 def _withdraw(builder: TrajectoryBuilder, outside: Outside, holding: bool) -> None:
