@@ -26,6 +26,7 @@ from tumortrack.report.drawing import new_figure
 from tumortrack_resection.drafts import plan_resection
 from tumortrack_resection.film import TRUE, FilmSinkConfig, divided, film, moments
 from tumortrack_resection.motions import Motions, MotionStage
+from tumortrack_resection.operation import Operation, OperationConfig, Planned
 from tumortrack_resection.pictures import ABOVE, Body, draw_plan, plan_figure, shaded, side_view
 from tumortrack_resection.values import (
     CUTS_TUMOR,
@@ -246,7 +247,9 @@ def test_a_film_of_what_is_followed_shows_it_over_the_truth_and_why_the_arms_sta
     )
     cell = Workcell("sweep 2", line="arms: sweep 2", shapes=shapes)
     halted = replace(cell, stopped="planning again")
-    sink = FilmSinkConfig(path=tmp_path / "a.gif", every_s=0.1).open(small_setting())
+    of = Planned(planned(), seen().meshes, acted("sweep 1"))
+    arms = replace(small_setting(), controller=Operation(of, OperationConfig(), draw))
+    sink = FilmSinkConfig(path=tmp_path / "a.gif", every_s=0.1).open(arms)
     there = small_anatomy()
     lower = there.with_parts(p.with_vertices(p.vertices_mm + [0, 0, 12.0]) for p in there.parts)
     for n in range(6):
@@ -275,7 +278,9 @@ def test_a_film_of_what_is_followed_shows_it_over_the_truth_and_why_the_arms_sta
     with pytest.raises(InputError):
         FilmSinkConfig(path=tmp_path / "a.mp4")
     with pytest.raises(InputError):
-        FilmSinkConfig(path=tmp_path / "a.gif").open(small_setting())
+        FilmSinkConfig(path=tmp_path / "a.gif").open(arms)  # it is there
+    with pytest.raises(InputError):
+        FilmSinkConfig(path=tmp_path / "b.gif").open(small_setting())
 
 
 def test_the_piece_leaves_with_the_holder(tmp_path: Path, monkeypatch):

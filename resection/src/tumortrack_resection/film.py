@@ -28,6 +28,7 @@ from tumortrack_resection.motions import Joints, Motions, MotionStage, Stage
 from tumortrack_resection.pictures import Body, shaded
 from tumortrack_resection.strokes import trimmed
 from tumortrack_resection.values import ELECTRODE, Located, ResectionPlan
+from tumortrack_resection.workcell import cut_lines
 
 FPS, FRAMES = 10, 120  # a GIF counts hundredths of a second; about so many
 _SIZE_IN = 6.4, 4.8  # of the scene, 100 pixels each
@@ -89,15 +90,11 @@ def film(
             piece = [body._replace(world_from_mesh=moved) for body in goes]
             bodies = stays if name == "home" else [*stays, *piece]
             over = name in (Stage.LIFT, Stage.RELEASE)
-            at = moment.stage.sweep or (plan.sweeps + 1) * over
-            lines = [
-                Polyline("", cut.path_mm,
-                         CUT if cut.sweep < at else NOW if cut.sweep == at else TO_CUT)
-                for cut in plan.cuts
-            ]  # fmt: skip
+            lines = cut_lines(plan.cuts, moment.stage.sweep or (plan.sweeps + 1) * over)
             state = name + ": the electrode is energised" * moment.cutting
             words = f"{_TITLE}\n{state}", plan.warnings, [str(located.patient)]
-            drawn = _coloured(shapes, moment.cutting)
+            lit = f"cutter/{ELECTRODE}" if moment.cutting else ""
+            drawn = [replace(s, colour=ENERGISED) if s.name == lit else s for s in shapes]
             pictures.append(_picture(drawn, bodies, lines, boxes, located.organ, words))
             progress(len(pictures), len(frames))
     _write(pictures, path)
@@ -118,11 +115,6 @@ def _boxes(shapes: Sequence[RigidShape], organ: Mesh) -> tuple[np.ndarray, np.nd
     ]
     flat = np.concatenate([*ends, organ.vertices_mm]) @ _OBLIQUE[:2].T
     return flat.min(0) - _ROOM_MM, flat.max(0) + _ROOM_MM
-
-
-def _coloured(shapes: Sequence[RigidShape], cutting: bool) -> list[RigidShape]:
-    lit = f"cutter/{ELECTRODE}" if cutting else ""
-    return [replace(s, colour=ENERGISED) if s.name == lit else s for s in shapes]
 
 
 def _write(pictures: Sequence[Image.Image], path: Path) -> None:
@@ -188,6 +180,8 @@ class FilmSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="film"):
         self.check_between("film:", every_s=(0.03, 3600))
 
     def open(self, context: SinkContext) -> FilmSink:
+        if context.controller is None:
+            raise InputError("film: nothing here moves an arm; it is for `tumortrack resect`.")
         check_place(self.path, "", None)
         return FilmSink(self, str(context.patient))
 

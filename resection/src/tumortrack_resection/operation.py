@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from scipy.spatial import cKDTree
 
 from tumortrack.assessment.advice import Place, Reach, advise, worthwhile
-from tumortrack.core.colours import CUT, ENERGISED, NOW, TO_CUT
+from tumortrack.core.colours import ENERGISED
 from tumortrack.core.config import Config
 from tumortrack.core.errors import InputError, TumortrackError
 from tumortrack.core.estimate import Estimate
@@ -30,7 +30,7 @@ from tumortrack_resection.halt import Halt
 from tumortrack_resection.motions import CUTTER, JOINTS, Execution, Joints, Motions, Stage
 from tumortrack_resection.swept import Swept
 from tumortrack_resection.values import ELECTRODE, Located, ResectionPlan
-from tumortrack_resection.workcell import TipOf, Workcell, stage_words
+from tumortrack_resection.workcell import TipOf, Workcell, cut_lines, stage_words
 
 _OTHER_PARTS = 2.0  # they may move so many times as far as the tumor
 _COMPARED = 500  # points of surfaces with different triangles
@@ -205,12 +205,8 @@ class Operation:
     def workcell(self) -> Workcell:
         execution, plan = self._execution, self.planned.plan
         joints, sweep = execution.joints_rad, execution.sweep
-        lines = []
-        for number, cut in enumerate(plan.cuts, start=1):
-            colour = CUT if cut.sweep < sweep else NOW if cut.sweep == sweep else TO_CUT
-            lines.append(Polyline(f"cut/{number}", cut.path_mm, colour, 0.8))
         above = plan.grasp_mm + np.outer([40.0, 0.0], plan.lift)
-        lines.append(Polyline("grasp", above, (90, 200, 255), 0.8))
+        lines = (*cut_lines(plan.cuts, sweep), Polyline("grasp", above, (90, 200, 255), 0.8))
         drawn = self._draw(joints)
         if execution.cutting:
             drawn = tuple(
@@ -231,7 +227,7 @@ class Operation:
             kind=(state, halt and halt.same_as),
             joints_rad=dict(zip(JOINTS, joints.tolist(), strict=True)),
             shapes=(*self.static_shapes, *drawn),
-            lines=tuple(lines),
+            lines=lines,
             halt=halt,
             left_mm=None if now is None else now.left_mm,
             cutting=execution.cutting,

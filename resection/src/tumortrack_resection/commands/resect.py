@@ -43,7 +43,7 @@ class Resect(ResectOptions):
             if self.live is not None or self.sinks:
                 raise InputError(
                     "--film shows the stored plan: give it without sinks and --live. A run is "
-                    "recorded by the sink recording:FOLDER."
+                    "recorded by the sink recording:FOLDER, and filmed by film:FILE.gif."
                 )
             store.check_place(self.film, "", None)
             say(f"A film of {self.plan}, within a minute or two: checks motions, then draws.")
