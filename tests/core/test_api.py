@@ -58,6 +58,7 @@ OTHERS = {
         "DepthFrame",
         "Estimate",
         "Evaluation",
+        "Cut",
         "FreeSpace",
         "Grasp",
         "Intrinsics",

@@ -22,7 +22,7 @@ from tumortrack.assessment.sight import Sight, sight_of
 from tumortrack.core.assessment import Assessment, ErrorBound, deciding
 from tumortrack.core.errors import NotThisOrgan
 from tumortrack.core.estimate import Estimate
-from tumortrack.core.evidence import MOMENTARY
+from tumortrack.core.evidence import FREE, MOMENTARY
 from tumortrack.core.report import (
     EvidenceReport,
     Finding,
@@ -59,6 +59,9 @@ _MIN_PROBABILITY = 0.6  # mean over a tumor's points
 # Pieces of evidence: of earlier frames; of this one, that agree, also for each that does not.
 _FEW, _MANY, _FOR_EACH = 3, 8, 5
 _MAX_UNSEEN = 0.1  # share of the organ's image without points of a cloud
+# Of a flap's near side: where it was taken for the organ's surroundings, points showed 13 and
+# 15 % of where it would have been, else half or more. Tools hold it so near to its tumor.
+_LEAST_OF_FLAP, _ON_FLAP_MM = 0.35, 10.0
 _OUTVOTED = 3  # later pieces at that place that agree with the answer, and so with each other
 _THERE_MM = 15.0  # from what the answer has there: how far apart touches of one spot may lie
 Advise = Literal["all", "touches", "nothing"]
@@ -174,11 +177,27 @@ def finding_of(
         return Finding("seen_through", {"percent": 100 * sight.through})
     finding = _misplaced_camera(report.views)
     finding = finding or _misfit(report, sight.rim > _RIM_SHARE and not strictly)
-    finding = finding or _doubt(report, bounds)
+    finding = finding or _unseen_flap(report) or _doubt(report, bounds)
     unseen = sight.unseen or 0.0
     if finding is None and unseen > _MAX_UNSEEN and not _deciding(report, bounds):
         return Finding("unseen", {"percent": 100 * unseen})
     return finding
+
+
+def _unseen_flap(report: FitReport) -> Finding | None:
+    """Whether hardly anything is seen of a flap where it would be, nor known by a tool: it may have
+    been lifted out of what is taken for the organ."""
+    for name, seen in ({} if report.cut is None else report.cut.flaps).items():
+        part = report.parts[name]
+        if seen >= _LEAST_OF_FLAP or part.center_mm is None or part.box_mm is None:
+            continue
+        reach_mm = float(np.ptp(np.array(part.box_mm), axis=0).max()) / 2 + _ON_FLAP_MM
+        places = [each.places_mm for each in report.evidence
+                  if not each.rejected and each.name != FREE]  # fmt: skip
+        away_mm = [np.linalg.norm(np.array(p) - part.center_mm, axis=1).min() for p in places]
+        if min(away_mm, default=np.inf) > reach_mm:
+            return Finding("flap", {"part": name, "percent": 100 * seen})
+    return None
 
 
 def _misplaced_camera(views: ViewsReport | None) -> Finding | None:

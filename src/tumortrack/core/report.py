@@ -25,7 +25,7 @@ Kind = Literal[
     "not_judged", "poses", "outliers", "fit", "size", "upside_down", "tilted", "not_turned",
     "alternative",
     "missing", "unsure", "miss", "depths", "improbable", "seen_through", "unseen", "hidden_now",
-    "evidence", "disputed", "cut_unknown", "cut_new", "model", "frame_in_doubt", "good_again",
+    "evidence", "disputed", "cut_unknown", "flap", "cut_new", "model", "frame_in_doubt", "good_again",
     # No estimate: the frame or its source.
     "no_frame", "source", "defect", "stamp_negative", "stamp_back", "stale", "future", "too_late",
     "frozen", "other_frame_id", "frame_id_changed", "intrinsics_changed", "moved", "cameras",
@@ -325,13 +325,14 @@ class MotionReport(_Value, frozen=True, kw_only=True):
 
 class CutReport(_Value, frozen=True, kw_only=True):
     """What an answer knows of cuts: at how many places (one in each cube of 1.5 mm), how wide they
-    are, and which tumors have a flap; ``outliers``: share of the points beside it that lie on no
-    surface. Live, ``known``: how many places are known by now, also those that the answer does not
-    know yet; ``unknown``: of which share of an electrode's way nobody knows where it was."""
+    are, and of each tumor's flap the share of its near side that points show; ``outliers``: share
+    of the points beside it that lie on no surface. Live, ``known``: how many places are known by
+    now, also those that the answer does not know yet; ``unknown``: of which share of an electrode's
+    way nobody knows where it was."""
 
     places: int = 0
     kerf_mm: float = 0.0
-    flaps: tuple[str, ...] = ()
+    flaps: dict[str, float] = {}
     outliers: float = 0.0
     known: int = 0
     unknown: float = 0.0

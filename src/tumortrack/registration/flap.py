@@ -25,6 +25,7 @@ from tumortrack.case.surface import largest_shell
 from tumortrack.core.cloud import FEWEST_POINTS
 from tumortrack.core.errors import InputError
 from tumortrack.core.evidence import Cut
+from tumortrack.core.geometry import triangles_of
 from tumortrack.core.report import CutReport
 from tumortrack.core.solids import mesh_of, solid_of
 from tumortrack.core.types import Mesh
@@ -51,6 +52,7 @@ _NEAR_STEPS = 1.5  # from the last place of a cut, in its places' distances, it 
 # are presumed (kidneys have 5 to 30 kPa): they decide how much has to be cut before a flap moves.
 _LOAD_MN, _TISSUE_KPA = 2000.0, 15.0
 _MOST_MM = 8.0  # of a flap's motion, one deviation, however little holds it
+_SEEN_MM = 4.0  # of a point: there a surface is seen
 _BESIDE_MM = 10.0  # of a cut: there its flap and its bed are seen
 _MINE = 0.2  # of a cut's places that are nearest to a tumor: less was not cut for it
 _RESTS, _REST_STEPS = 2, 8  # of places of the rest from which fits start; of the way there
@@ -339,6 +341,21 @@ def cut_report(fit: RefinedFit, config: GaussNewtonConfig) -> CutReport | None:
     return CutReport(
         places=len(cut.points_ct),
         kerf_mm=cut.kerf_mm,
-        flaps=tuple(cut.flaps),
+        flaps={name: _seen(fit, cells) for name, cells in cut.flaps.items()},
         outliers=float(far.mean()) if beside.any() else 0.0,
     )
+
+
+def _seen(fit: RefinedFit, cells_ct: Float64[np.ndarray, "k 3"]) -> float:
+    """Of the part of a flap's surface that faces the first camera, the share with points near."""
+    motion, organ = fit.motion, fit.motion.shape.anatomy_ct.organ
+    middles, normals = triangles_of(organ.vertices_mm, organ.faces)
+    reach_mm = motion.shape.body.spacing_mm
+    mine = cKDTree(cells_ct).query(middles, distance_upper_bound=reach_mm)[0] < np.inf
+    places_mm = motion.forward(middles[mine])
+    facing = ((normals[mine] @ motion.rotation.T) * places_mm).sum(1) < 0
+    areas = np.linalg.norm(normals[mine], axis=1)[facing]
+    if not facing.any() or not len(fit.views.points_mm):
+        return 0.0
+    near = cKDTree(fit.views.points_mm).query(places_mm[facing])[0] < _SEEN_MM
+    return float(np.average(near, weights=areas))
