@@ -25,7 +25,8 @@ Kind = Literal[
     "not_judged", "poses", "outliers", "fit", "size", "upside_down", "tilted", "not_turned",
     "alternative",
     "missing", "unsure", "miss", "depths", "improbable", "seen_through", "unseen", "hidden_now",
-    "evidence", "disputed", "cut_unknown", "flap", "cut_new", "model", "frame_in_doubt", "good_again",
+    "evidence", "disputed", "cut_unknown", "cut_new", "flap", "model", "frame_in_doubt",
+    "good_again",
     # No estimate: the frame or its source.
     "no_frame", "source", "defect", "stamp_negative", "stamp_back", "stale", "future", "too_late",
     "frozen", "other_frame_id", "frame_id_changed", "intrinsics_changed", "moved", "cameras",
