@@ -23,7 +23,7 @@ from tumortrack.core.types import Mesh
 from tumortrack.organ.finite import BlockCholesky, LatticeSolid
 
 LEVER_MM = 50.0  # a rotation's unknown is the motion at this lever arm
-_FORCED = 150  # places of forces for the compliance; 80 leave nearly the same errors
+FORCED = 150  # places of forces for the compliance; 80 leave nearly the same errors
 _FREE = 1e-4  # N/mm: keeps rigid motions solvable without contacts
 
 
@@ -93,16 +93,20 @@ def modes_of(
 
 
 def compliance_modes(
-    solid: LatticeSolid, patches: Patches, count: int, factor: BlockCholesky | None = None
+    solid: LatticeSolid,
+    patches: Patches,
+    count: int,
+    factor: BlockCholesky | None = None,
+    forced: int = FORCED,
 ) -> Float64[np.ndarray, "f k"]:
     """How the organ yields to forces anywhere on its surface, as displacements of the solid's
     nodes: the ``count`` principal components of its responses to independent forces along three
-    axes at ``_FORCED`` places, balanced by inertia. With independent coefficients N(0, 1) of all
+    axes at ``forced`` places, balanced by inertia. With independent coefficients N(0, 1) of all
     components the surface moves by 1 mm rms along each axis. ``factor``: of another stiffness than
     the usual one. Source: forces anywhere, without boundary conditions, as in BCF-FEM (Yang et al.
     2024, arXiv 2403.09964)."""
     points_mm, areas = patches.points_mm, patches.areas_mm2
-    chosen = np.empty((1, min(_FORCED, len(areas))), np.int64)
+    chosen = np.empty((1, min(forced, len(areas))), np.int64)
     farthest(np.ascontiguousarray(points_mm.T[None], np.float32), np.zeros(1, np.int64), chosen)
     radius_mm = np.sqrt(areas.sum() / chosen.size) / 2
     spots = np.stack([patches.spot(place, radius_mm) * areas for place in points_mm[chosen[0]]], 1)

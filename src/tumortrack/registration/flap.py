@@ -46,6 +46,7 @@ _NEIGHBOURS = 10  # of a place of the cut, through which its plane is laid
 # that a stray place touches does not count.
 _CROSSED = 0.12
 _CUT, _OPEN = 1e-3, 1e-4  # stiffness of cut cells, and of empty ones beside them, of what was there
+_PATCHES, _FORCED = 600, 80  # as of the intact body's, and half of its places of forces: sooner
 _STEP_MM, _RIM_MM = 1.0, 2.0  # of the field with the groove; how far round a kerf it changes
 _NEAR_STEPS = 1.5  # from the last place of a cut, in its places' distances, it ends
 # What a flap bears, mN, each axis: its weight or a cup's pull; and how stiff tissue is, kPa. Both
@@ -86,9 +87,9 @@ def cut_shape(shape: RestShape, cuts: Sequence[Cut], poisson: float) -> RestShap
     kerf_mm = max(cut.kerf_mm for cut in cuts)
     kerf = _kerf(shape.distances[0], points_ct, kerf_mm)
     field, organ = _grooved(shape.distances[0], kerf), _without(shape.anatomy_ct.organ, kerf)
-    patches = patches_of(shape.anatomy_ct.organ, 600, np.random.default_rng(0))
+    patches = patches_of(shape.anatomy_ct.organ, _PATCHES, np.random.default_rng(0))
     assert body.compliance is not None
-    compliance = compliance_modes(solid, patches, body.compliance.shape[-1], factor)
+    compliance = compliance_modes(solid, patches, body.compliance.shape[-1], factor, _FORCED)
     new = replace(
         body,
         modes=np.concatenate([body.modes, *modes], axis=-1),
