@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float32
 
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
@@ -22,6 +22,7 @@ _RIM = 2  # pixels round the organ (some 3 mm)
 _PIXEL_MM = 1.5  # of the image in which a cloud is compared
 _MAX_PIXELS = 1024  # along a side
 _MAX_POINTS = 20_000  # of a cloud: enough for the shares, where all of 400,000 would delay a frame
+_STEP_MM = 3.0  # by which a flap may lie off, before it is seen past its rim
 _SEEN_WITHIN_MM = 6.0  # of a point, or twice the points' usual distance
 
 
@@ -39,13 +40,13 @@ class Sight(NamedTuple):
 
 
 def sight_of(estimate: Estimate, views: Sequence[View]) -> Sight:
-    images, clouds = [], []
+    images, clouds, cut = [], [], estimate.report.cut is not None
     pairs = _organ_before_cameras(estimate, views)
     for (organ, seen), view in zip(pairs, views, strict=False):  # a network takes the first alone
         if isinstance(seen, DepthFrame):
-            images.append(seen_through(organ, seen, _behind_mm(view)))
+            images.append(seen_through(organ, seen, _behind_mm(view), cut))
         elif len(seen.points_mm):  # touches alone hide nothing, and are no scan
-            clouds.append(cloud_shares(organ, seen, _behind_mm(view)))
+            clouds.append(cloud_shares(organ, seen, _behind_mm(view), cut))
     by_depth = max((share for share, _, _ in images), default=0.0)
     return Sight(
         through=max(by_depth, *(share for share, _ in clouds), 0.0),
@@ -77,7 +78,7 @@ def _behind_mm(view: View) -> float:
 
 
 def seen_through(
-    organ: Mesh, frame: DepthFrame, behind_mm: float = _THROUGH_MM
+    organ: Mesh, frame: DepthFrame, behind_mm: float = _THROUGH_MM, cut: bool = False
 ) -> tuple[float, float, float]:
     """Three shares of the estimated organ's image, all 0 if no pixel has a return there.
 
@@ -86,6 +87,9 @@ def seen_through(
     2. Of a rim round the image: where something lies behind the organ's nearest point. A wrong
        organ reaches beyond the true one, and is seen through if something can be seen there.
     3. Where nothing hides the organ.
+
+    ``cut``: beside a flap's rim the organ has steps in depth, and the flap may lie a little off:
+    there the deeper surface counts.
     """
     seen_mm, organ_mm = _compared(organ, frame)
     image = np.isfinite(organ_mm)
@@ -95,6 +99,8 @@ def seen_through(
     in_sight = (seen_mm[both] > organ_mm[both] - behind_mm).sum() / image.sum()
     rim = _within(_RIM, image) & ~image
     rim_share = (seen_mm[rim] > organ_mm[image].min()).sum() / max(rim.sum(), 1)
+    if cut:
+        organ_mm = _deepest(organ_mm, _STEP_MM * _pixels_per_mm(frame, organ_mm))
     through = (seen_mm[both] > organ_mm[both] + behind_mm).mean()
     return float(through), float(rim_share), float(in_sight)
 
@@ -120,7 +126,7 @@ def _compared(organ: Mesh, frame: DepthFrame) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cloud_shares(
-    organ: Mesh, cloud: SensorCloud, behind_mm: float = _THROUGH_MM
+    organ: Mesh, cloud: SensorCloud, behind_mm: float = _THROUGH_MM, cut: bool = False
 ) -> tuple[float, float]:
     """Of a cloud, whose camera is at its origin: the share of the points in the organ's image that
     lie behind its surface, and the share of the image without points."""
@@ -140,17 +146,32 @@ def cloud_shares(
     column, row = np.rint(focal * points_mm[:, :2] / points_mm[:, 2:] - low).astype(int).T
     within = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     column, row, z_mm = column[within], row[within], points_mm[within, 2]
-    surface_mm = organ_mm[row, column]
-    on = np.isfinite(surface_mm)
+    image = np.isfinite(organ_mm)
+    deepest_mm = _deepest(organ_mm, _STEP_MM / _PIXEL_MM) if cut else organ_mm
+    surface_mm = deepest_mm[row, column]
+    on = image[row, column]
     if not on.any():
         return 0.0, 1.0
     through = float((z_mm[on] > surface_mm[on] + behind_mm).mean())
     filled = np.zeros(organ_mm.shape, bool)
     filled[row, column] = True
-    image = np.isfinite(organ_mm)
     spacing = np.sqrt(image.sum() / on.sum())  # pixels between neighbouring points
     near = _within(max(_SEEN_WITHIN_MM / _PIXEL_MM, 2 * spacing), filled)
     return through, float(1 - near[image].mean())
+
+
+def _pixels_per_mm(frame: DepthFrame, organ_mm: Float32[np.ndarray, "h w"]) -> float:
+    """Of the smaller image, at the organ."""
+    full, middle_mm = frame.intrinsics, float(np.median(organ_mm[np.isfinite(organ_mm)]))
+    return full.fx * organ_mm.shape[1] / full.width / middle_mm
+
+
+def _deepest(organ_mm: Float32[np.ndarray, "h w"], radius_px: float) -> Float32[np.ndarray, "h w"]:
+    """The organ's deepest surface so near to each pixel."""
+    from scipy.ndimage import maximum_filter
+
+    shown = np.where(np.isfinite(organ_mm), organ_mm, -np.inf)
+    return np.asarray(maximum_filter(shown, 1 + 2 * round(radius_px)), np.float32)
 
 
 def _within(reach: float, filled: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
