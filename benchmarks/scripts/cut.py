@@ -15,6 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal, NamedTuple
 
+import msgspec
 import numpy as np
 import pandas as pd
 import tyro
@@ -34,6 +35,7 @@ from tumortrack.io import scene_folder
 from tumortrack.io.case import load_case
 from tumortrack.io.evidence_files import evidence_json, read_evidence
 from tumortrack.io.mesh_files import write_anatomy
+from tumortrack.registration.frame import estimate_of
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.report import drawing
 from tumortrack.tracking.tracker import Tracker
@@ -51,12 +53,16 @@ from tumortrack_benchmarks.physics.tets import TETS
 from tumortrack_benchmarks.physics.views import render_view
 from tumortrack_benchmarks.scripting import cell
 from tumortrack_experiment.kit.base import laid_down as bench_from_ct
+from tumortrack_resection.drafts import plan_resection
+from tumortrack_resection.located import of_estimate
+from tumortrack_resection.values import ResectionConfig
 
 _BARE_MM, _BARE = 0.7, 0.1  # a tumor is free so near to the organ's surface; share: exophytic
 _DEEP_MM = (1.0, 10.0)  # of an endophytic tumor's nearest place
 _TUMOR_ML = (1.0, 26.0)
 _CLEAR_MM = 3.0  # of other tumors from the cut
 _LEAN_DEGREES = 40.0  # of the way out from the vertical, at most
+_GRID = 64  # of the volume on which the planner sees the organ
 _LONG_MM, _ROD_MM = 20.0, 6.0  # the cup's length; radius of the rod behind it
 _POINT_MM = 1.0  # error of a place of the cut, of the cup, of what it holds
 _OWN_MM = 5.0  # depths that differ less from the true surface's are of it
@@ -65,7 +71,8 @@ _SMOKE_PX, _POOL_PX = 12.0, 6.0
 _LEAST_SEEN, _VIEWS = 0.4, 20  # of the organ's pixels, before smoke; views among which one has that
 _MOST, _STEPS = 0.85, 7  # of the surface that is cut; states of a sequence
 _WRONG_MM = 5.0
-_COLOURS = ("#b2182b", "#2166ac", "#ef8a62", "#67a9cf")
+_ASIDE_MM = 2.0  # a shift of all places of a cut, which is stated
+_COLOURS = {"nothing": "#b2182b", "the cut": "#2166ac", "both": "#67a9cf"}
 
 
 @dataclass(frozen=True)
@@ -79,7 +86,8 @@ class Options:
     seed: int = 9
     """Organs are numbered from 1000 times this."""
     plan: Literal["many", "sequence"] = "many"
-    """Four states in six views each; or a cut and a lift that grow, in two views."""
+    """Four states in six views each, some cut along planes; or cut and lift grow along the
+    planner's, in two views."""
     only_make: bool = False
     """Measure nothing."""
     document: Path | None = None
@@ -111,11 +119,11 @@ def asked(plan: str, rng: Generator) -> dict[str, tuple[float, crack.Lift]]:
     if plan == "sequence":
         shares = np.linspace(0, _MOST, _STEPS).tolist()
         return {f"step{n}": (s, crack.Lift(10.0 * s / _MOST)) for n, s in enumerate(shares)}
-    turn = crack.Lift(rng.uniform(0.0, 4.0), rng.uniform(15.0, 45.0))
+    turn = crack.Lift(rng.uniform(0.0, 4.0), rng.uniform(15.0, 33.0))
     return {
         "half-4": (0.5, crack.Lift(4.0)),
         "most-10": (_MOST, crack.Lift(10.0)),
-        "some": (rng.uniform(0.2, 0.9), crack.Lift(rng.uniform(0.0, 10.0))),
+        "some": (rng.uniform(0.2, 0.9), crack.Lift(max(0.0, rng.uniform(-5.0, 10.0)))),
         "turned": (rng.uniform(0.6, 0.9), turn),
     }
 
@@ -149,13 +157,17 @@ def make(folder: Path, number: int, plan: str) -> None:
     lean, out = np.deg2rad(rng.uniform(0, _LEAN_DEGREES)), crack.way_out(anatomy, tumor)
     x, y, z = turned_by(lean * unit(np.cross(out, rng.normal(size=3)))) @ out
     turn, deep, planes = rng.uniform(0, 2 * np.pi), rng.uniform(0, 70.0), int(rng.integers(-8, 7))
+    planes, name = 6 if plan == "sequence" else planes, anatomy.names[1 + tumor]
 
     def laid(anatomy_ct: Anatomy) -> tuple[np.ndarray, Anatomy, crack.CutSurface]:
         to_bench = bench_from_ct(anatomy_ct.organ, (x, y, z))
         there, way = transformed(anatomy_ct, to_bench), to_bench[:3, :3] @ out
-        along = turned_by(turn * way) @ perpendicular(way)
         if planes > 0:
-            return to_bench, there, crack.facets(there.tumors[tumor], way, along, planes)
+            shown = estimate_of(dict(zip(there.names, there.parts, strict=True)), _GRID)
+            wanted = ResectionConfig(tumor=name, most_facets=planes, least_exophytic=0.0)
+            cuts = plan_resection(of_estimate(shown), wanted)
+            return to_bench, there, crack.facets(cuts.facets, cuts.lift)
+        along = turned_by(turn * way) @ perpendicular(way)
         return to_bench, there, crack.shell(there.tumors[tumor], way, along, deep)
 
     _, there, surface = laid(anatomy)
@@ -171,10 +183,10 @@ def make(folder: Path, number: int, plan: str) -> None:
     few = simplified(load_case(folder / "case").anatomy)
     (to_bench, there, surface), inner = laid(few), scene_folder.draw_targets(few, number)
     incision = crack.Incision.of(there, surface, tumor, folder / TETS)
-    about = {"family": "cut", "exophytic": bare > _BARE, "tumor": anatomy.names[1 + tumor],
+    about = {"family": "cut", "exophytic": bare > _BARE, "tumor": name,
              "surface": f"{planes} planes" if planes > 0 else "shell"}  # fmt: skip
-    for name, (share, lift) in asked(plan, rng).items():
-        looks = {folder / f"{name}-{seen_as}": look for seen_as, look in LOOKS[plan].items()}
+    for state_name, (share, lift) in asked(plan, rng).items():
+        looks = {folder / f"{state_name}-{seen_as}": look for seen_as, look in LOOKS[plan].items()}
         missing = {path: look for path, look in looks.items() if not path.exists()}
         try:
             state = crack.solve(incision, share, lift, number) if missing else None
@@ -182,13 +194,13 @@ def make(folder: Path, number: int, plan: str) -> None:
                 assert state is not None
                 rng_of_view = np.random.default_rng([number, look.view, 7])
                 scene, held = seen(state, to_bench, inner, look, rng_of_view)
-                meta = {**scene.meta, **about, "state": name}
+                meta = {**scene.meta, **about, "state": state_name}
                 with store.new_folder(path) as aside_path:
                     scene_folder.write_scene_files(aside_path, replace(scene, meta=meta))
                     known = evidence_json((*scene.evidence, held))
                     store.write_atomically(aside_path / "held.json", known)
         except TumortrackError as error:
-            print(f"{number}, {name}: {error}", flush=True)
+            print(f"{number}, {state_name}: {error}", flush=True)
 
 
 def _suited(anatomy: Anatomy, rng: Generator) -> tuple[int, float]:
@@ -305,6 +317,14 @@ def _rows(
     about = {key: meta[key] for key in (*keys, "tumor_moved_mm", "flap_turned_degrees")}
     about |= {"rigid_mm": rigid_centers_mm(model, scene)[part]}
     told = {"nothing": (), "the cut": known[:-1], "the hold": known[-1:], "both": known}
+    for cut in known[:-1]:
+        assert isinstance(cut, Cut)
+        points = np.array(cut.points_ct)
+        aside = _ASIDE_MM * unit(np.random.default_rng(len(points)).normal(size=3))
+        told["the cut, 2 mm aside"] = (
+            msgspec.structs.replace(cut.of_ct(points + aside), shared_std_mm=_ASIDE_MM),
+        )
+        told["a third of the cut"] = (cut.of_ct(points[::3]),)
     for name, evidence in told.items():
         row: dict[str, Any] = {**about, "told": name, "quality": "none"}
         try:
@@ -352,7 +372,8 @@ def picture(rows: pd.DataFrame, path: Path) -> None:
     """Errors over the share that is cut: a dot each, and medians by steps of a tenth."""
     figure = drawing.new_figure(7.0, 4.2, left=0.1, right=0.97, top=0.95, bottom=0.14)
     axes = figure.add_subplot()
-    for colour, (told, some) in zip(_COLOURS, rows.groupby("told", sort=False), strict=True):
+    for told, colour in _COLOURS.items():
+        some = rows[rows.told == told]
         axes.plot(some.share, some.off_mm, ".", ms=3, alpha=0.4, color=colour)
         medians = some.groupby(some.share.round(1)).off_mm.median()
         axes.plot(medians.index, medians, color=colour, label=f"told: {told}")

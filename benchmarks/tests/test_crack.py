@@ -21,6 +21,7 @@ from tumortrack.core.types import Anatomy
 from tumortrack.io.scene_folder import draw_targets
 from tumortrack_benchmarks.physics.crack import (
     KERF_MM,
+    MARGIN_MM,
     Incision,
     Lift,
     Opened,
@@ -49,9 +50,13 @@ def incision(kind: str) -> Incision:
     out = way_out(there, 0)
     along = np.cross(np.cross(out, X), out)
     along /= np.linalg.norm(along)
-    planes = kind == "planes"
-    tumor = there.tumors[0]
-    surface = facets(tumor, out, along, 3) if planes else shell(tumor, out, along, 20.0)
+    surface = shell(there.tumors[0], out, along, 20.0)
+    if kind == "planes":
+        normals = np.array(
+            [[-0.8, 0.0, -0.6], [0.0, 0.8, -0.6], [0.0, -0.8, -0.6], [0.8, 0.0, -0.6]]
+        )
+        reach = (there.tumors[0].vertices_mm @ normals.T).max(0) + MARGIN_MM
+        surface = facets(np.column_stack([normals, reach]), UP)
     with TemporaryDirectory() as folder:
         return Incision.of(there, surface, 0, Path(folder) / "tets.safetensors")
 
@@ -67,7 +72,8 @@ def test_no_tetrahedron_crosses_the_surface_and_what_is_cut_grows(kind: str) -> 
     off = surface.distance(mesh.nodes_mm)[0][mesh.tets]
     across = np.minimum(off.max(1), -off.min(1))  # how far its corners reach beyond
     assert np.quantile(across, 0.99) < 0.1
-    assert across.max() < (1.5 if kind == "planes" else 0.5)  # edges of planes are rounded
+    most_mm = 1.5 if kind == "planes" else 0.5  # where planes meet, it is rounded
+    assert across.max() < most_mm
     assert mesh.volumes_mm3.sum() == pytest.approx(
         incision(kind).organ.anatomy.organ.volume_mm3, rel=0.02
     )
@@ -79,7 +85,9 @@ def test_no_tetrahedron_crosses_the_surface_and_what_is_cut_grows(kind: str) -> 
             tuple(p) for p in outer.mean(1).round(6)
         }
         assert not set(np.split(wound.walls, 2)[0].ravel()) >= set(wound.walls.ravel())
-        assert np.abs(surface.distance(inner.reshape(-1, 3))[0]).max() < 0.5
+        off = np.abs(surface.distance(inner.reshape(-1, 3))[0])
+        assert np.quantile(off, 0.9) < 0.1
+        assert off.max() < most_mm
         assert surface.order(inner.mean(1)).max() <= surface.order(left).min()
         if len(before):
             assert cKDTree(inner.mean(1)).query(before)[0].max() < 1e-9  # it stays cut

@@ -19,7 +19,7 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 from scipy.special import logsumexp, softmax
 
-from tumortrack.core.geometry import transform_points, turned_by, unit
+from tumortrack.core.geometry import perpendicular, transform_points, turned_by, unit
 from tumortrack.core.mesh_query import surface_distance
 from tumortrack.core.rigid_fit import kabsch
 from tumortrack.core.solids import mesh_of, solid_of
@@ -39,6 +39,7 @@ _ROUGH_MM, _AROUND_MM = 8.0, 12.0  # of the tissue round a tumor
 # So far outside the hull is so much wider than the tumor: the piece comes out.
 _OUTSIDE_MM, _OPENS = 60.0, 1.3
 _CORNER_MM = 1.0  # planes meet over this width
+_LEVEL = 0.1  # a normal with less across the way out is of a plane below the piece
 _WALL_KPA_MM = 150.0
 _NEAR_MM = 14.0  # of the surface: tissue into which the other wall may come
 _LEAST_VOLUME = 0.2  # of a tetrahedron, when its nodes are moved onto the surface
@@ -90,17 +91,11 @@ def shell(
     return CutSurface(distance, lambda points_mm: points_mm @ way, out, along)
 
 
-def facets(
-    tumor: Mesh, out: Vector, along: Vector, count: int, margin_mm: float = MARGIN_MM
-) -> CutSurface:
-    """So many planes at a margin from the tumor, cut one after the other: one below it, or planes
-    that slant inwards round it; from five on one of them below it."""
-    under = [-out] if count in (1, 5, 6) else []
-    turns = np.pi + np.linspace(0, 2 * np.pi, count - len(under), endpoint=False)
-    slant = np.deg2rad(45.0 if count == 2 else 30.0)
-    level = np.cos(turns)[:, None] * along + np.sin(turns)[:, None] * np.cross(out, along)
-    normals = np.array([*(np.cos(slant) * level - np.sin(slant) * out), *under])
-    offsets = (tumor.vertices_mm @ normals.T).max(0) + margin_mm
+def facets(planes: Float64[np.ndarray, "k 4"], out: Vector) -> CutSurface:
+    """The inner sides of planes (outward normal, offset), cut one after the other."""
+    normals, offsets = planes[:, :3], planes[:, 3]
+    level = normals[-1] - (normals[-1] @ out) * out
+    along = unit(level) if np.linalg.norm(level) > _LEVEL else perpendicular(out)
 
     def distance(points_mm: Points) -> tuple[Values, Points]:
         off = (points_mm @ normals.T - offsets) / _CORNER_MM
