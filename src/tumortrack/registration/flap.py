@@ -102,14 +102,28 @@ def cut_shape(shape: RestShape, cuts: Sequence[Cut], poisson: float) -> RestShap
 
 
 def carried_over(motion: ElasticMotion, shape: RestShape) -> ElasticMotion:
-    """A motion of the same organ, of which less or more was cut."""
-    coefficients = np.zeros(shape.body.modes.shape[-1])
-    count = min(len(coefficients), len(motion.coefficients))
-    coefficients[:count] = motion.coefficients[:count]
+    """A motion of the same organ, of which less or more was cut: its flaps stay where they were."""
+    coefficients, of_flaps = np.zeros(shape.body.modes.shape[-1]), _flaps_of(motion.shape)
+    library = motion.shape.body.modes.shape[-1] - motion.shape.flap_modes
+    coefficients[:library] = motion.coefficients[:library]
+    for name, flap in _flaps_of(shape).items():
+        if name in of_flaps:
+            coefficients[flap] = motion.coefficients[of_flaps[name]]
     others = tuple((carried_over(other, shape), share) for other, share in motion.alternatives)
     return replace(
         motion, shape=shape, coefficients=coefficients, covariance=None, alternatives=others
     )
+
+
+def _flaps_of(shape: RestShape) -> dict[str, slice]:
+    """Which coefficients are each flap's."""
+    if shape.cut is None:
+        return {}
+    first = shape.body.modes.shape[-1] - shape.flap_modes
+    return {
+        name: slice(first + FLAP_MODES * number, first + FLAP_MODES * (number + 1))
+        for number, name in enumerate(shape.cut.flaps)
+    }
 
 
 def flap_starts(
@@ -158,11 +172,10 @@ def _away_of_flaps_mm(
 
 
 def _with_flaps_moved(motion: ElasticMotion) -> Iterator[ElasticMotion]:
-    covariance = motion.shape.body.covariance
-    for first in range(len(covariance) - motion.shape.flap_modes, len(covariance), FLAP_MODES):
-        flap = slice(first, first + FLAP_MODES)
-        squares, axes = np.linalg.eigh(covariance[flap, first : first + 3][:3])
-        by_shift = covariance[flap, first : first + 3] @ axes / np.sqrt(squares)
+    for flap in _flaps_of(motion.shape).values():
+        covariance = motion.shape.body.covariance[flap, flap]
+        squares, axes = np.linalg.eigh(covariance[:3, :3])
+        by_shift = covariance[:, :3] @ axes / np.sqrt(squares)
         for way in (*_STARTED * by_shift.T, *-_STARTED * by_shift.T):
             coefficients = motion.coefficients.copy()
             coefficients[flap] = way
