@@ -35,7 +35,7 @@ from tumortrack.organ.modes import RigidMotions, compliance_modes, patches_of
 from tumortrack.organ.rest_shape import FLAP_MODES, CutOrgan, DistanceField, RestShape
 from tumortrack.registration.compliance import RefinedFit
 from tumortrack.registration.config import GaussNewtonConfig
-from tumortrack.registration.gauss_newton import FARTHEST, refine
+from tumortrack.registration.gauss_newton import FARTHEST, RegistrationResult, refine
 from tumortrack.registration.motion import ElasticMotion
 from tumortrack.registration.multi_view import MultiViewCloud
 from tumortrack.registration.search import far_from
@@ -56,9 +56,9 @@ _MOST_MM = 8.0  # of a flap's motion, one deviation, however little holds it
 _SEEN_MM = 4.0  # of a point: there a surface is seen
 _BESIDE_MM = 10.0  # of a cut: there its flap and its bed are seen
 _MINE = 0.2  # of a cut's places that are nearest to a tumor: less was not cut for it
-_RESTS, _REST_STEPS = 2, 8  # of places of the rest from which fits start; of the way there
+_RESTS, _REST_STEPS = 3, 8  # of places of the rest from which fits start; of the way there
 _LIFTED_MM = 12.0  # from where a flap was: points so near may be its
-_STARTED = 1.5  # deviations of a flap's shift, from which fits start
+_STARTED = 1.5  # deviations of a flap's motion, from which fits start
 
 
 def cut_shape(shape: RestShape, cuts: Sequence[Cut], poisson: float) -> RestShape:
@@ -131,20 +131,23 @@ def flap_starts(
 ) -> list[ElasticMotion]:
     """Where fits of an organ that was cut start, beside ``starts``: those are of an organ in one
     piece, and lie between a lifted flap and its rest. First the rest is fitted to the points beside
-    the flap; from there with each flap shifted both ways along each axis, and turned as it then
-    is."""
-    rests, few = list[ElasticMotion](), msgspec.structs.replace(config, steps=_REST_STEPS)
+    the flap; from there with each flap shifted and turned both ways along each axis of its
+    prior."""
+    rests, few = list[RegistrationResult](), msgspec.structs.replace(config, steps=_REST_STEPS)
     for start in starts:
         if (cut := start.shape.cut) is None or not cut.flaps:
             return []
         rest = np.flatnonzero(_away_of_flaps_mm(start, views.points_mm) == np.inf)
-        if len(rest) < FEWEST_POINTS or len(rests) == _RESTS:
+        if len(rest) < FEWEST_POINTS:
             continue
         some = replace(views, points_mm=views.points_mm[rest], view=views.view[rest])
-        motion = replace(refine(start.shape, some, start, few).motion, covariance=None)
-        if far_from(motion, rests):
-            rests.append(motion)
-    return [moved for motion in rests for moved in (motion, *_with_flaps_moved(motion))]
+        rests.append(refine(start.shape, some, start, few))
+    found = list[ElasticMotion]()
+    for fit in sorted(rests, key=lambda fit: fit.cost):
+        motion = replace(fit.motion, covariance=None)
+        if len(found) < _RESTS and far_from(motion, found):
+            found.append(motion)
+    return [moved for motion in found for moved in (motion, *with_flaps_moved(motion))]
 
 
 def with_points_of_flaps(motion: ElasticMotion, views: MultiViewCloud) -> MultiViewCloud:
@@ -171,14 +174,14 @@ def _away_of_flaps_mm(
     return flaps.query(motion.inverse(points_mm), distance_upper_bound=_LIFTED_MM)[0]
 
 
-def _with_flaps_moved(motion: ElasticMotion) -> Iterator[ElasticMotion]:
+def with_flaps_moved(motion: ElasticMotion) -> Iterator[ElasticMotion]:
+    """With each flap moved both ways along each axis of its prior, from where it is."""
     for flap in _flaps_of(motion.shape).values():
-        covariance = motion.shape.body.covariance[flap, flap]
-        squares, axes = np.linalg.eigh(covariance[:3, :3])
-        by_shift = covariance[:, :3] @ axes / np.sqrt(squares)
-        for way in (*_STARTED * by_shift.T, *-_STARTED * by_shift.T):
+        squares, axes = np.linalg.eigh(motion.shape.body.covariance[flap, flap])
+        ways = _STARTED * (axes * np.sqrt(squares)).T
+        for way in (*ways, *-ways):
             coefficients = motion.coefficients.copy()
-            coefficients[flap] = way
+            coefficients[flap] += way
             yield replace(motion, coefficients=coefficients)
 
 

@@ -34,7 +34,7 @@ from tumortrack.core.process import parallel_map
 from tumortrack.organ.rest_shape import RestShape
 from tumortrack.registration.compliance import RefinedFit, refine_compliance
 from tumortrack.registration.config import GaussNewtonConfig
-from tumortrack.registration.flap import flap_starts, with_points_of_flaps
+from tumortrack.registration.flap import flap_starts, with_flaps_moved, with_points_of_flaps
 from tumortrack.registration.gauss_newton import (
     FARTHEST,
     GaussNewton,
@@ -102,7 +102,8 @@ class Registration:
         with timed("search"):
             starts = self.search.starts(views, again)
         with timed("refine"):
-            best = self.best_fit(views, starts, known)
+            beside = [] if again else flap_starts(views, starts, self.config)
+            best = self.best_fit(views, starts, known, beside)
             if views.count == 1:
                 return self.with_all_points(*self._with_flap(best, views))
             fits = [self._correct_cameras(views, fit) for fit in (best, *best.others)]
@@ -163,15 +164,19 @@ class Registration:
         views: MultiViewCloud,
         starts: Sequence[ElasticMotion],
         known: RegistrationResult | None = None,
+        beside: Sequence[ElasticMotion] = (),
     ) -> RegistrationResult:
-        """The most likely fit with the cameras as stated, from all starts and from some beside the
-        best. ``known``: a fit of before."""
+        """The most likely fit with the cameras as stated, from all starts, from those ``beside`` of
+        them that are not known to lie apart, and from some beside the best. ``known``: a fit of
+        before."""
         fits = [] if known is None else [known]
         new = [Start(motion) for motion in starts if far_from(motion, [fit.motion for fit in fits])]
-        new += map(Start, flap_starts(views, starts, self.config))
+        new += map(Start, beside)
         fits += self._fit_promising(views, new, fits)
         best = min(fits, key=lambda fit: cost_with_prior(fit, self.prior))
-        fits += self._fit_promising(views, turned_starts(best.motion, best.pose_offset), fits)
+        turned = turned_starts(best.motion, best.pose_offset)
+        turned += [Start(motion, best.pose_offset) for motion in with_flaps_moved(best.motion)]
+        fits += self._fit_promising(views, turned, fits)
         return select_best(fits, self.prior)
 
     def _fit_promising(
