@@ -23,6 +23,7 @@ from scipy.ndimage import binary_dilation, gaussian_filter
 from scipy.spatial import cKDTree
 
 import tumortrack as tt
+from tumortrack import registration
 from tumortrack.core import store
 from tumortrack.core.cloud import CloudConfig, cloud_from_depth
 from tumortrack.core.errors import NoEstimate, TumortrackError
@@ -302,7 +303,10 @@ def _measured(folder: Path) -> list[dict[str, Any]]:
             for row in _rows(tracker, scene_folder.read_scene(path), known):
                 yield {**about, **row}
 
-    return scripting.kept(folder / "rows.json", {"scenes": [path.name for path in scenes]}, measure)
+    # The method's fingerprint is of intact organs.
+    code = scripting.code_sha256(Path(registration.__path__[0]).glob("*.py"))
+    about = {"scenes": [path.name for path in scenes], "registration": code}
+    return scripting.kept(folder / "rows.json", about, measure)
 
 
 def _rows(
