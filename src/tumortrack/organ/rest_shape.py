@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64, UInt8
+from scipy.spatial import cKDTree
 
 from tumortrack.core.errors import InputError
 from tumortrack.core.geometry import triangles_of
@@ -125,15 +126,34 @@ def error_covariance_mm2(points_ct: Float[np.ndarray, "n 3"]) -> Float64[np.ndar
     return _ERROR_MM**2 * np.exp(-squares / (2 * _LENGTH_MM**2))
 
 
+class Flap(NamedTuple):
+    """Of an organ that was cut (CT, mm): places all over it, and of its surface with their normals,
+    as long as the areas that they stand for."""
+
+    cells_ct: Float64[np.ndarray, "k 3"]
+    surface_ct: Float64[np.ndarray, "s 3"]
+    normals_mm2: Float64[np.ndarray, "s 3"]
+
+
 @dataclass(frozen=True, eq=False)
 class CutOrgan:
-    """What was cut (``registration.flap``): places of it in the CT, mm, and how wide; the names of
-    the tumors with a flap, and places all over each (CT, mm); the organ before."""
+    """What was cut (``registration.flap``): places of it in the CT, mm, and how wide; the flaps, by
+    their tumors' names; the organ before."""
 
     points_ct: Float64[np.ndarray, "n 3"]
     kerf_mm: float
-    flaps: dict[str, Float64[np.ndarray, "k 3"]]
+    flaps: dict[str, Flap]
     intact: RestShape
+
+    @cached_property
+    def places(self) -> cKDTree:
+        """Of the cut."""
+        return cKDTree(self.points_ct)
+
+    @cached_property
+    def cells(self) -> cKDTree:
+        """Of all flaps."""
+        return cKDTree(np.concatenate([flap.cells_ct for flap in self.flaps.values()]))
 
 
 @dataclass(frozen=True, eq=False)

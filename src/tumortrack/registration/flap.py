@@ -32,7 +32,7 @@ from tumortrack.core.types import Mesh
 from tumortrack.organ.body import ElasticBody
 from tumortrack.organ.finite import CONTRAST, BlockCholesky, ElementLattice, LatticeSolid
 from tumortrack.organ.modes import RigidMotions, compliance_modes, patches_of
-from tumortrack.organ.rest_shape import FLAP_MODES, CutOrgan, DistanceField, RestShape
+from tumortrack.organ.rest_shape import FLAP_MODES, CutOrgan, DistanceField, Flap, RestShape
 from tumortrack.registration.compliance import RefinedFit
 from tumortrack.registration.config import GaussNewtonConfig
 from tumortrack.registration.gauss_newton import FARTHEST, RegistrationResult, refine
@@ -53,6 +53,7 @@ _NEAR_STEPS = 1.5  # from the last place of a cut, in its places' distances, it 
 # are presumed (kidneys have 5 to 30 kPa): they decide how much has to be cut before a flap moves.
 _LOAD_MN, _TISSUE_KPA = 2000.0, 15.0
 _MOST_MM = 8.0  # of a flap's motion, one deviation, however little holds it
+_SURFACE = 500  # places of a flap's surface by which it is judged how much of it is seen
 _SEEN_MM = 4.0  # of a point: there a surface is seen
 _BESIDE_MM = 10.0  # of a cut: there its flap and its bed are seen
 _MINE = 0.2  # of a cut's places that are nearest to a tumor: less was not cut for it
@@ -77,8 +78,6 @@ def cut_shape(shape: RestShape, cuts: Sequence[Cut], poisson: float) -> RestShap
     crossed = crossed_cells(solid, points_ct)
     factor = solid.factor_of(_softened(solid, crossed))
     flaps = dict(_flaps(shape, solid, crossed, points_ct))
-    middles = lattice.origin_mm + lattice.spacing_mm * (solid.cells + 0.5)
-    places = {name: middles[flap] for name, flap in flaps.items()}
     modes, states = list[np.ndarray](), list[np.ndarray]()
     for flap in flaps.values():
         mine, covariance = _modes_of(solid, factor, flap)
@@ -98,7 +97,16 @@ def cut_shape(shape: RestShape, cuts: Sequence[Cut], poisson: float) -> RestShap
     )
     anatomy = replace(shape.anatomy_ct, parts=(organ, *shape.anatomy_ct.tumors))
     distances = (field, *shape.distances[1:])
-    return RestShape(anatomy, new, distances, CutOrgan(points_ct, kerf_mm, places, shape))
+    middles = lattice.origin_mm + lattice.spacing_mm * (solid.cells + 0.5)
+    of_flaps = {n: _flap(middles[flap], organ, lattice.spacing_mm) for n, flap in flaps.items()}
+    return RestShape(anatomy, new, distances, CutOrgan(points_ct, kerf_mm, of_flaps, shape))
+
+
+def _flap(cells_ct: Float64[np.ndarray, "k 3"], organ: Mesh, spacing_mm: float) -> Flap:
+    middles, normals = triangles_of(organ.vertices_mm, organ.faces)
+    mine = cKDTree(cells_ct).query(middles, distance_upper_bound=spacing_mm)[0] < np.inf
+    some = np.flatnonzero(mine)[:: max(1, int(mine.sum()) // _SURFACE)]
+    return Flap(cells_ct, middles[some], normals[some])
 
 
 def carried_over(motion: ElasticMotion, shape: RestShape) -> ElasticMotion:
@@ -170,8 +178,8 @@ def _away_of_flaps_mm(
     """How far points (camera frame) lie from where flaps were; infinite where they cannot be
     theirs."""
     assert motion.shape.cut is not None
-    flaps = cKDTree(np.concatenate(list(motion.shape.cut.flaps.values())))
-    return flaps.query(motion.inverse(points_mm), distance_upper_bound=_LIFTED_MM)[0]
+    points_ct = motion.inverse(points_mm)
+    return motion.shape.cut.cells.query(points_ct, distance_upper_bound=_LIFTED_MM)[0]
 
 
 def with_flaps_moved(motion: ElasticMotion) -> Iterator[ElasticMotion]:
@@ -353,26 +361,22 @@ def cut_report(fit: RefinedFit, config: GaussNewtonConfig) -> CutReport | None:
     if (cut := fit.motion.shape.cut) is None:
         return None
     points_ct = fit.motion.inverse(fit.views.points_mm)
-    beside = cKDTree(cut.points_ct).query(points_ct, distance_upper_bound=_BESIDE_MM)[0] < np.inf
+    beside = cut.places.query(points_ct, distance_upper_bound=_BESIDE_MM)[0] < np.inf
     far = np.abs(fit.distances_mm[beside]) > FARTHEST * fit.views.width_mm(config)
     return CutReport(
         places=len(cut.points_ct),
         kerf_mm=cut.kerf_mm,
-        flaps={name: _seen(fit, cells) for name, cells in cut.flaps.items()},
+        flaps={name: _seen(fit, flap) for name, flap in cut.flaps.items()},
         outliers=float(far.mean()) if beside.any() else 0.0,
     )
 
 
-def _seen(fit: RefinedFit, cells_ct: Float64[np.ndarray, "k 3"]) -> float:
+def _seen(fit: RefinedFit, flap: Flap) -> float:
     """Of the part of a flap's surface that faces the first camera, the share with points near."""
-    motion, organ = fit.motion, fit.motion.shape.anatomy_ct.organ
-    middles, normals = triangles_of(organ.vertices_mm, organ.faces)
-    reach_mm = motion.shape.body.spacing_mm
-    mine = cKDTree(cells_ct).query(middles, distance_upper_bound=reach_mm)[0] < np.inf
-    places_mm = motion.forward(middles[mine])
-    facing = ((normals[mine] @ motion.rotation.T) * places_mm).sum(1) < 0
-    areas = np.linalg.norm(normals[mine], axis=1)[facing]
+    motion = fit.motion
+    places_mm = motion.forward(flap.surface_ct)
+    facing = ((flap.normals_mm2 @ motion.rotation.T) * places_mm).sum(1) < 0
     if not facing.any() or not len(fit.views.points_mm):
         return 0.0
     near = cKDTree(fit.views.points_mm).query(places_mm[facing])[0] < _SEEN_MM
-    return float(np.average(near, weights=areas))
+    return float(np.average(near, weights=np.linalg.norm(flap.normals_mm2[facing], axis=1)))

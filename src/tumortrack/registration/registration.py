@@ -102,10 +102,10 @@ class Registration:
         with timed("search"):
             starts = self.search.starts(views, again)
         with timed("refine"):
-            beside = [] if again else flap_starts(views, starts, self.config)
-            best = self.best_fit(views, starts, known, beside)
+            best = self.best_fit(views, starts, known, again)
             if views.count == 1:
-                return self.with_all_points(*self._with_flap(best, views))
+                found = (best, views) if again else self._with_flap(best, views)
+                return self.with_all_points(*found)
             fits = [self._correct_cameras(views, fit) for fit in (best, *best.others)]
             return select_best(fits if known is None else [known, *fits], self.prior)
 
@@ -164,18 +164,20 @@ class Registration:
         views: MultiViewCloud,
         starts: Sequence[ElasticMotion],
         known: RegistrationResult | None = None,
-        beside: Sequence[ElasticMotion] = (),
+        again: bool = False,
     ) -> RegistrationResult:
-        """The most likely fit with the cameras as stated, from all starts, from those ``beside`` of
-        them that are not known to lie apart, and from some beside the best. ``known``: a fit of
-        before."""
+        """The most likely fit with the cameras as stated, from all starts and from some beside the
+        best. ``known``: a fit of before; ``again``: there is no reason to doubt it, so that a cut
+        organ's flaps are not searched for."""
         fits = [] if known is None else [known]
         new = [Start(motion) for motion in starts if far_from(motion, [fit.motion for fit in fits])]
-        new += map(Start, beside)
+        if not again:
+            new += map(Start, flap_starts(views, starts, self.config))
         fits += self._fit_promising(views, new, fits)
         best = min(fits, key=lambda fit: cost_with_prior(fit, self.prior))
         turned = turned_starts(best.motion, best.pose_offset)
-        turned += [Start(motion, best.pose_offset) for motion in with_flaps_moved(best.motion)]
+        if not again:
+            turned += [Start(motion, best.pose_offset) for motion in with_flaps_moved(best.motion)]
         fits += self._fit_promising(views, turned, fits)
         return select_best(fits, self.prior)
 
