@@ -10,6 +10,7 @@ from elastic_objects import SMALL as BODY
 from elastic_objects import UP, organ
 from render_objects import anatomy
 from tumortrack.core.cloud import CloudConfig
+from tumortrack.core.mesh_query import surface_distance, thinned
 from tumortrack.organ.body import build_body
 from tumortrack.simulation.deform import ElasticConfig
 from tumortrack.simulation.noise import D405_NOISE
@@ -68,6 +69,15 @@ def test_labelled_points_lie_in_the_scene_as_the_reference_does(simulator, pool)
     cloud = scene.cloud.points_mm
     assert (cloud > reference.organ.box_mm[0] - 0.1).all()
     assert (cloud < reference.organ.box_mm[1] + 0.1).all()
+
+
+def test_a_coarser_surface_shows_the_same_organ():
+    organ, *tumors = ANATOMY.parts
+    shown = ANATOMY.with_parts([thinned(organ, 2.5), *tumors])
+    assert len(shown.organ.faces) < len(organ.faces)
+    scene = Simulator(shown, UP, SceneConfig(occupancy=SMALL)).render(recipe(1))
+    true = organ.with_vertices(scene.forward(organ.vertices_mm))
+    assert surface_distance(true, scene.cloud.points_mm).mean() < 2.5 / 8
 
 
 def stream(pool, config=TINY, size=3, name="train"):

@@ -156,6 +156,7 @@ def test_the_model_says_what_it_was_made_from(case, quick_model):
     last = json.loads(lines[-1])
     assert last["step"] == STEPS
     assert last["samples_per_s"] > 0
+    assert 0 < last["validation_loss"] < np.log(4)  # of four classes, by chance
     assert 0 < last["learning_rate"] < 1e-3  # the schedule has nearly ended
     assert list((quick_model / "training" / "tensorboard").iterdir())
     again = tumortrack(*train_command(case, quick_model))
@@ -211,7 +212,7 @@ import torch.utils.tensorboard  # its own caches are not the point
 resource.setrlimit(resource.RLIMIT_FSIZE, (300, 300))
 import signal
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-numbers = 1.0, 0.5, 100.0, 1e-3, 0.0
+numbers = 1.0, 0.9, 0.5, 100.0, 1e-3, 0.0
 progress = TrainingProgress()
 try:
     with history(folder, progress) as write:
@@ -343,7 +344,8 @@ def test_a_containers_quota_of_cores_counts(tmp_path, monkeypatch, files, cores)
 
 
 @pytest.mark.parametrize(
-    ("granted", "workers", "threads"), [("", 1, 5), ("2", 1, 2), ("", 5, 3), ("9", 0, 6)]
+    ("granted", "workers", "threads"),
+    [("", 1, 5), ("2", 1, 2), ("", 5, 3), ("9", 0, 6), ("", None, 6)],
 )
 def test_the_network_gets_the_cores_that_workers_and_openmp_leave(
     monkeypatch, granted, workers, threads
@@ -351,7 +353,7 @@ def test_the_network_gets_the_cores_that_workers_and_openmp_leave(
     before = torch.get_num_threads()
     monkeypatch.setenv("OMP_NUM_THREADS", granted)
     monkeypatch.setattr("tumortrack_occupancy.training.train.available_cores", lambda: 6)
-    assert divide_cores(torch.device("cpu"), workers) == workers
+    assert divide_cores(torch.device("cpu"), workers) == (6 if workers is None else workers)
     try:
         assert torch.get_num_threads() == threads
     finally:

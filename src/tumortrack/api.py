@@ -238,7 +238,7 @@ def train(
     case: StrPath | Case,
     folder: StrPath,
     *,
-    preset: Literal["elastic", "quick", "paper"] = "elastic",
+    preset: Literal["elastic", "quick", "quick-long", "paper"] = "elastic",
     config: ModelConfig | None = None,
     rotations: Literal["limited", "full"] | None = None,
     sensor: Literal["d405", "stereo"] | None = None,
@@ -259,7 +259,7 @@ def train(
     Args:
         case: or the folder that ``prepare`` wrote.
         folder: the model's, to write.
-        preset: ``elastic`` registers the organ of the CT, ``quick`` and ``paper`` label points.
+        preset: ``elastic`` registers the organ of the CT, the others label points.
         config: a changed preset instead: ``msgspec.structs.replace(presets.quick(anatomy), ...)``.
         rotations: of the preset: how the organ may lie (default: as the case says; ``quick`` and
             ``paper``: limited).

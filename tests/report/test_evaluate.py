@@ -16,7 +16,7 @@ from report_objects import anatomy, ball, estimate_of, scene
 from tumortrack.cli.console import say_table
 from tumortrack.core.colours import TUMORS, css
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.report.page import thinned
+from tumortrack.core.mesh_query import thinned
 from tumortrack.report.protocol import check_place, evaluate_scenes, failure
 from tumortrack.report.summary import conclusions, error_table, headlines, part_table, summarise
 

@@ -67,6 +67,7 @@ class TrainConfig(ModelConfig, frozen=True):
     schedule: Schedule
     batch_size: int
     steps: int  # where neither steps nor minutes are given
+    cell_mm: float = 0.0  # scenes show an organ of so much larger triangles; 0: the case's
     drop_points: float = 0.0  # largest fraction of a batch's encoded points dropped at random
     ema: float = 0.999  # of the weights; 0: no average
     training_pairs: int = 0  # scenes repeat after so many; 0: never

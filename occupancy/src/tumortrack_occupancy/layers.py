@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor, nn
@@ -32,11 +32,12 @@ class Layer(nn.Module):
 
     def activate(self, linear_out: Tensor) -> Tensor:
         """Batch norm and ReLU of the linear part's output, which is overwritten."""
-        return functional.relu(self.normalise(linear_out), inplace=True)
+        # In rows: overwriting a view makes autograd copy it.
+        rows = linear_out if self.norm is None else self.norm(linear_out.flatten(0, -2))
+        return functional.relu(rows, inplace=True).view(linear_out.shape)
 
     def forward(self, x: Tensor) -> Tensor:
-        # In rows: the output of a linear layer on more axes is a view, and overwriting a view
-        # makes autograd copy it.
+        # The output of a linear layer on more axes is a view, too.
         rows = self.activate(self.linear(x.flatten(0, -2)))
         return rows.view(*x.shape[:-1], -1)
 
@@ -61,13 +62,28 @@ def stack(widths: tuple[int, ...], norm: Norm) -> nn.Sequential:
 
 def max_over_neighbours(values: Tensor) -> Tensor:
     """The maximum over the K neighbours, (B, M, K, C) -> (B, M, C), by pooling, which is several
-    times faster than a maximum along an axis. Its backward pass is slow on a CPU; there the
-    gradient goes through an indexing of the same values."""
-    batch, _, k, channels = values.shape
+    times faster than a maximum along an axis."""
+    if values.requires_grad and values.device.type == "cpu":
+        return cast(Tensor, _Maximum.apply(values))
     channels_first = values.permute(0, 3, 1, 2)
-    if not values.requires_grad or values.device.type != "cpu":
-        return functional.max_pool2d(channels_first, (1, k)).squeeze(-1).transpose(1, 2)
-    with torch.no_grad():
-        _, index = functional.max_pool2d(channels_first, (1, k), return_indices=True)
-    row = torch.arange(batch)[:, None, None]
-    return values.flatten(1, 2)[row, index.squeeze(-1).transpose(1, 2), torch.arange(channels)]
+    return functional.max_pool2d(channels_first, (1, values.shape[2])).squeeze(-1).transpose(1, 2)
+
+
+class _Maximum(torch.autograd.Function):
+    """The same with a backward pass for a CPU, where that of pooling is slow."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor) -> Tensor:
+        k = values.shape[2]
+        pooled = functional.max_pool2d(values.permute(0, 3, 1, 2), (1, k), return_indices=True)
+        out, index = (each.squeeze(-1).transpose(1, 2) for each in pooled)
+        ctx.save_for_backward(index % k)
+        ctx.neighbours = k
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
+        (index,), (gradient,) = ctx.saved_tensors, gradients
+        batch, centres, channels = gradient.shape
+        zeros = gradient.new_zeros((batch, centres, ctx.neighbours, channels))
+        return zeros.scatter_(2, index[:, :, None], gradient[:, :, None])

@@ -42,10 +42,17 @@ def paper(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
     return presets.paper(anatomy, rotations)
 
 
+def quick_long(anatomy: Anatomy, rotations: Rotations = "limited") -> TrainConfig:
+    """See ``presets.quick_long``."""
+    from tumortrack_occupancy import presets
+
+    return presets.quick_long(anatomy, rotations)
+
+
 class OccupancyMethod:
     """See ``tumortrack.registration.method.Method``."""
 
-    presets: Mapping[str, Preset] = {"quick": quick, "paper": paper}
+    presets: Mapping[str, Preset] = {"quick": quick, "quick-long": quick_long, "paper": paper}
 
     def has_config(self, config: object) -> bool:
         from tumortrack_occupancy.config import TrainConfig

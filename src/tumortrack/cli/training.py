@@ -29,7 +29,8 @@ class Train:
         case: folder that `prepare` wrote.
         model: folder to write.
         preset: elastic registers the organ of the CT and learns nothing (default): a model of other
-            poses or another sensor than the case's. quick and paper label points by a network.
+            poses or another sensor than the case's. quick, quick-long (for hours) and paper
+            label points by a network.
         rotations: how the organ may lie: turned about the line of sight and tilted, or in any way
             (default: as the case says; quick and paper: limited, tilts up to 15 degrees).
         sensor: whose errors the scenes have: a RealSense D405's, or those of depth by matching a
@@ -45,7 +46,7 @@ class Train:
 
     case: Positional[Path]
     model: Positional[Path]
-    preset: Literal["elastic", "quick", "paper"] = "elastic"
+    preset: Literal["elastic", "quick", "quick-long", "paper"] = "elastic"
     rotations: Literal["limited", "full"] | None = None
     sensor: Literal["d405", "stereo"] | None = None
     minutes: float | None = None

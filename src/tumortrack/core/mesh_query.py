@@ -145,3 +145,17 @@ def rough_margin(part: Mesh, margin_mm: float) -> Mesh:
     np.add.at(normals, part.faces.ravel(), np.repeat(weighted, 3, axis=0))
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     return part.with_vertices(part.vertices_mm + margin_mm * normals)
+
+
+def thinned(mesh: Mesh, cell_mm: float) -> Mesh:
+    """A coarser mesh to draw: the vertices in a cubic cell are replaced by their mean."""
+    cells = np.floor(mesh.vertices_mm / cell_mm).astype(np.int64)
+    group, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)[1:]
+    means = [np.bincount(group, mesh.vertices_mm[:, axis]) / count for axis in range(3)]
+    a, b, c = group[mesh.faces].T
+    faces = group[mesh.faces][(a != b) & (b != c) & (c != a)]
+    # A thin fold collapses to two sheets with the same corners: drop faces that occur in pairs.
+    _, kind, times = np.unique(
+        np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    return Mesh(np.stack(means, axis=1), faces[times[kind] % 2 == 1])

@@ -21,6 +21,7 @@ from tumortrack.core.assessment import Quality
 from tumortrack.core.estimate import Estimate, verdict_words
 from tumortrack.core.evidence import CAMERA
 from tumortrack.core.geometry import plane_section
+from tumortrack.core.mesh_query import thinned
 from tumortrack.core.organ import is_tumor
 from tumortrack.core.patient import patient_in
 from tumortrack.core.store import write_atomically
@@ -119,20 +120,6 @@ def page_scene(scene: Scene, shown: Mapping[str, Mesh], picture: Path) -> dict[s
         image.save(webp, "WEBP", quality=82, method=2)
     box = [lower.round(1).tolist(), upper.round(1).tolist()]
     return {"layers": layers, "box": box, "picture": _base64(webp.getvalue())}
-
-
-def thinned(mesh: Mesh, cell_mm: float) -> Mesh:
-    """A coarser mesh for display: the vertices in a cubic cell are replaced by their mean."""
-    cells = np.floor(mesh.vertices_mm / cell_mm).astype(np.int64)
-    group, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)[1:]
-    means = [np.bincount(group, mesh.vertices_mm[:, axis]) / count for axis in range(3)]
-    a, b, c = group[mesh.faces].T
-    faces = group[mesh.faces][(a != b) & (b != c) & (c != a)]
-    # A thin fold collapses to two sheets with the same corners: drop faces that occur in pairs.
-    _, kind, times = np.unique(
-        np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    return Mesh(np.stack(means, axis=1), faces[times[kind] % 2 == 1])
 
 
 def _surface(part: str, mesh: Mesh) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The presets by name: `elastic` registers the CT's organ, `quick` and `paper` classify points."""
+"""The presets by name: `elastic` registers the CT's organ, the others classify points."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ C = TypeVar("C", bound=ModelConfig)
 
 if not TYPE_CHECKING:
     __getattr__ = attributes_of("tumortrack.presets")
-__all__ = ["PRESETS", "elastic", "paper", "quick", "seen_by"]
+__all__ = ["PRESETS", "elastic", "paper", "quick", "quick_long", "seen_by"]
 
 
 def quick(anatomy: Anatomy, rotations: Rotations = "limited") -> Any:
@@ -26,12 +26,22 @@ def quick(anatomy: Anatomy, rotations: Rotations = "limited") -> Any:
     return method_of_preset("quick").presets["quick"](anatomy, rotations)
 
 
+def quick_long(anatomy: Anatomy, rotations: Rotations = "limited") -> Any:
+    """``quick`` for hours; likewise."""
+    return method_of_preset("quick-long").presets["quick-long"](anatomy, rotations)
+
+
 def paper(anatomy: Anatomy, rotations: Rotations = "limited") -> Any:
     """The ``TrainConfig`` of the paper's network; likewise."""
     return method_of_preset("paper").presets["paper"](anatomy, rotations)
 
 
-PRESETS: dict[str, Preset] = {"elastic": elastic, "quick": quick, "paper": paper}
+PRESETS: dict[str, Preset] = {
+    "elastic": elastic,
+    "quick": quick,
+    "quick-long": quick_long,
+    "paper": paper,
+}
 
 
 def seen_by(config: C, sensor: Sensor) -> C:

@@ -10,9 +10,11 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64, UInt8
+from torch.nn import functional
 
 from tumortrack.case.symmetry import ambiguous, half_turns
 from tumortrack.core.errors import NoEstimate
+from tumortrack.core.mesh_query import thinned
 from tumortrack.registration.in_distribution import InDistributionRange, fit_mm, spread_mm
 from tumortrack.simulation.scene import SceneRecipe, Simulator, body_for
 from tumortrack_occupancy.model import OccupancyModel
@@ -29,28 +31,33 @@ _QUERIES = 2**13  # at once: bounds the memory
 
 class OccupancyTask:
     """Labels of points near surfaces, as in the paper. ``points``: labelled points for training
-    scenes; ``body``: the elastic body, if scenes need it. Raises InputError: a part is too small to
-    be learnt."""
+    scenes, which show ``shown_ct``; ``body``: the elastic body, if they need it. Raises InputError:
+    a part is too small to be learnt."""
 
     def __init__(self, run: TrainingRun, device: torch.device) -> None:
         self._run, self._device = run, device
         self.points = OccupancyPool(run.anatomy_ct, run.config.scene.occupancy, run.seed)
+        organ, *tumors = run.anatomy_ct.parts
+        shown = thinned(organ, run.config.cell_mm) if run.config.cell_mm else organ
+        self.shown_ct = run.anatomy_ct.with_parts([shown, *tumors])
         self.body = body_for(run.anatomy_ct, run.up_lps, run.config.scene, run.seed)
 
     @torch.no_grad()
-    def miou(self, network: OccupancyNetwork) -> float:
-        """Mean IoU of the parts (organ, tumors; not the outside) over all points of the validation
-        scenes."""
+    def validate(self, network: OccupancyNetwork) -> tuple[float, float]:
+        """Over all points of the validation scenes: cross-entropy, and mean IoU of the parts
+        (organ, tumors; not the outside)."""
         network.eval()
         arrays = self._scenes.clouds_mm, self._scenes.points_mm
         batches = (torch.from_numpy(v).to(self._device).split(_AT_ONCE) for v in arrays)
-        predicted = torch.cat([network(*pair).argmax(-1) for pair in zip(*batches, strict=True)])
+        logits = torch.cat([network(*pair).cpu() for pair in zip(*batches, strict=True)])
+        labels = torch.from_numpy(self._scenes.labels.astype(np.int64))
+        loss = float(functional.cross_entropy(logits.flatten(0, 1), labels.flatten()))
         n_classes = len(self._run.anatomy_ct.parts) + 1
-        pairs = predicted.cpu().numpy().ravel() * n_classes + self._scenes.labels.ravel()
+        pairs = logits.argmax(-1).numpy().ravel() * n_classes + self._scenes.labels.ravel()
         confusion = np.bincount(pairs, minlength=n_classes**2).reshape(n_classes, n_classes)
         intersection = confusion.diagonal()
         union = confusion.sum(0) + confusion.sum(1) - intersection
-        return float((intersection / np.maximum(union, 1))[1:].mean())
+        return loss, float((intersection / np.maximum(union, 1))[1:].mean())
 
     @torch.no_grad()
     def model(self, network: OccupancyNetwork, provenance: dict[str, Any]) -> OccupancyModel:

@@ -46,6 +46,7 @@ _Item = TypeVar("_Item")
 # Of each validation: name in history.jsonl, tag in TensorBoard, digits in history.jsonl
 _SCALARS = (
     ("loss", "loss/train", ".5f"),
+    ("validation_loss", "loss/validation", ".5f"),
     ("validation_miou", "miou/validation", ".4f"),
     ("samples_per_s", "speed/samples_per_s", ".1f"),
     ("learning_rate", "learning_rate", ".4g"),
@@ -117,7 +118,7 @@ def _scenes(
     """The batches of these steps."""
     config = run.config
     stream = SceneStream(
-        run.anatomy_ct, run.up_lps, config.scene, task.points, run.seed,
+        task.shown_ct, run.up_lps, config.scene, task.points, run.seed,
         stream="train", batch_size=config.batch_size, body=task.body,
     )  # fmt: skip
     period = config.training_pairs // config.batch_size
@@ -145,10 +146,10 @@ def run_steps(
             end_fixed = fix_last_step(run.config, progress, run.minutes)
             done = progress.step == progress.end
             if task and write and (done or progress.step % run.config.validate_every == 0):
-                miou = task.miou(state.average)
+                error, miou = task.validate(state.average)
                 state.keep_if_best(miou)
                 speed = clock.rate() * run.config.batch_size
-                write(loss, miou, speed, state.learning_rate, clock.waiting())
+                write(loss, error, miou, speed, state.learning_rate, clock.waiting())
             if done or end_fixed or stop or clock.due("checkpoint", run.checkpoint_every_s):
                 state.save(work)
             if done or clock.due("report", REPORT_EVERY_S):
@@ -211,15 +212,16 @@ def work_folder(folder: Path) -> Iterator[Path]:
 def divide_cores(device: torch.device, workers: int | None) -> int:
     """Return how many processes make scenes, and set PyTorch's number of threads: on a CPU the
     cores that the workers leave, but at least half of them, within OMP_NUM_THREADS. Without
-    ``workers`` there are as many as cores, at most 16: their priority is low (see ``scenes``)."""
-    cores = available_cores()
+    ``workers`` there are as many of both as cores, at most 16: the workers' priority is low (see
+    ``scenes``), so that they take what the network leaves, which may be next to nothing."""
+    cores, reserved = available_cores(), min(workers or 0, available_cores() // 2)
     if workers is None:
         workers = max(1, min(_MOST, cores))
     if device.type == "cpu":
         keep_freed_memory()
         granted = os.environ.get("OMP_NUM_THREADS", "")
         most = min(int(granted) if granted.isdigit() else _MOST, _MOST)
-        torch.set_num_threads(max(1, min(most, cores - min(workers, cores // 2))))
+        torch.set_num_threads(max(1, min(most, cores - reserved)))
     return workers
 
 
