@@ -15,7 +15,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal, NamedTuple
 
-import msgspec
 import numpy as np
 import pandas as pd
 import tyro
@@ -72,7 +71,6 @@ _SMOKE_PX, _POOL_PX = 12.0, 6.0
 _LEAST_SEEN, _VIEWS = 0.4, 20  # of the organ's pixels, before smoke; views among which one has that
 _MOST, _STEPS = 0.85, 7  # of the surface that is cut; states of a sequence
 _WRONG_MM = 5.0
-_ASIDE_MM = 2.0  # a shift of all places of a cut, which is stated
 _COLOURS = {"nothing": "#b2182b", "the cut": "#2166ac", "both": "#67a9cf"}
 
 
@@ -320,19 +318,15 @@ def _rows(
     keys = ("state", "share", "lift_mm", "degrees", "exophytic", "surface", "cup", "smoke")
     about = {key: meta[key] for key in (*keys, "tumor_moved_mm", "flap_turned_degrees")}
     about |= {"rigid_mm": rigid_centers_mm(model, scene)[part]}
-    told = {"nothing": (), "the cut": known[:-1], "the hold": known[-1:], "both": known}
-    for cut in known[:-1]:
-        assert isinstance(cut, Cut)
-        points = np.array(cut.points_ct)
-        aside = _ASIDE_MM * unit(np.random.default_rng(len(points)).normal(size=3))
-        told["the cut, 2 mm aside"] = (
-            msgspec.structs.replace(cut.of_ct(points + aside), shared_std_mm=_ASIDE_MM),
-        )
-        told["a third of the cut"] = (cut.of_ct(points[::3]),)
-    for name, evidence in told.items():
+    cut = tracker.with_cut([each for each in known if isinstance(each, Cut)])
+    told = {
+        "nothing": (tracker, ()), "the hold": (tracker, known[-1:]),
+        "the cut": (cut, ()), "both": (cut, known[-1:]),
+    }  # fmt: skip
+    for name, (using, evidence) in told.items():
         row: dict[str, Any] = {**about, "told": name, "quality": "none"}
         try:
-            found = tracker.locate(scene.cloud, grid=16, full_view=scene.depth, evidence=evidence)
+            found = using.locate(scene.cloud, grid=16, full_view=scene.depth, evidence=evidence)
         except NoEstimate:
             yield {**row, "off_mm": None, "radius_mm": None}
             continue
