@@ -318,7 +318,8 @@ def _rows(
     keys = ("state", "share", "lift_mm", "degrees", "exophytic", "surface", "cup", "smoke")
     about = {key: meta[key] for key in (*keys, "tumor_moved_mm", "flap_turned_degrees")}
     about |= {"rigid_mm": rigid_centers_mm(model, scene)[part]}
-    cut = tracker.with_cut([each for each in known if isinstance(each, Cut)])
+    cuts = [each for each in known if isinstance(each, Cut)]
+    cut = tracker.with_cut(cuts) if cuts else tracker
     told = {
         "nothing": (tracker, ()), "the hold": (tracker, known[-1:]),
         "the cut": (cut, ()), "both": (cut, known[-1:]),
