@@ -5,6 +5,7 @@ import pytest
 
 from stories import succeeded, tumortrack
 from tumortrack.core import store
+from tumortrack.registration.method import method_of_preset
 from tumortrack.report.inspection import describe
 
 pytestmark = pytest.mark.slow
@@ -28,3 +29,11 @@ def test_the_papers_chain_runs_beside_it(tmp_path):
     assert planned != ("no plan: " in said)  # as so short a training may end
     assert any("it labels points" in line for line in describe(out / "model"))
     assert any("trained for " in line for line in describe(out / "model"))
+
+
+def test_without_minutes_it_takes_the_weights_that_come_with_the_package(tmp_path):
+    said = succeeded(tumortrack("demo", "--out", tmp_path, "--preset", "quick", "--scenes", 1))
+    shipped = method_of_preset("quick").phantom_model("quick")
+    digest = store.sha256_of(shipped / store.MANIFEST)
+    assert store.read_json(tmp_path / "paper" / "report.json")["model_sha256"] == digest
+    assert said.index("default method:") < said.index("the paper's, quick:")

@@ -18,7 +18,14 @@ from tumortrack.core.colours import TUMORS, css
 from tumortrack.core.errors import InputError, NoEstimate
 from tumortrack.core.mesh_query import thinned
 from tumortrack.report.protocol import check_place, evaluate_scenes, failure
-from tumortrack.report.summary import conclusions, error_table, headlines, part_table, summarise
+from tumortrack.report.summary import (
+    conclusions,
+    error_table,
+    headlines,
+    part_table,
+    side_by_side,
+    summarise,
+)
 
 
 def answering(*answers):
@@ -268,6 +275,15 @@ def test_without_webgl_the_page_says_so_and_does_all_else(evaluated):
         until(lambda: chosen(browser) == "0", "the page")
         browser.click_text("worst")
         until(lambda: chosen(browser) == "2", "the worst scene")
+
+
+def test_methods_stand_side_by_side(evaluated):
+    entries = evaluated[1]["scenes"]
+    lost = {"name": "lost", "quality": "none", "parts": {"tumor_1": {"found": False, "iou": 0.0}}}
+    rows = side_by_side({"one": [*entries, lost], "two": [*entries[::-1], lost]}).rows
+    assert [row[0] for row in rows] == [entry["name"] for entry in (*entries, lost)]
+    assert [row[1:5] for row in rows[:-1]] == [row[5:] for row in rows[-2::-1]]
+    assert rows[-1][1:] == ["none", "-", "-", "-"] * 2
 
 
 def test_thinned_meshes_keep_shape():

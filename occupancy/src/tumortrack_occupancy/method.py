@@ -85,6 +85,10 @@ class OccupancyMethod:
 
         return OccupancyModel.from_folder(folder, manifest, device=device, **known)
 
+    def phantom_model(self, preset: str) -> Path | None:
+        folder = Path(__file__).with_name("phantom")
+        return folder if preset == "quick" else None
+
     def locator(self, model: Model) -> Locator:
         from tumortrack_occupancy.locator import OccupancyLocator
         from tumortrack_occupancy.model import OccupancyModel

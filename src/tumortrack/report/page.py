@@ -7,6 +7,7 @@ import io
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from datetime import date
 from html import escape
 from importlib import resources
 from pathlib import Path
@@ -26,6 +27,7 @@ from tumortrack.core.organ import is_tumor
 from tumortrack.core.patient import patient_in
 from tumortrack.core.store import write_atomically
 from tumortrack.core.types import Mesh
+from tumortrack.io.model_folder import training_words
 from tumortrack.report import pictures, seen
 
 if TYPE_CHECKING:
@@ -213,8 +215,17 @@ def write_page(report: dict[str, Any], scenes: list[dict[str, Any]], path: Path)
         ),
     ]
     whose = patient_in(report.get("patient"), "report")
-    words = f"Estimate against truth. {whose}. {said.verdict_counts(summary)}."
+    words = f"Estimate against truth. {whose}. {said.verdict_counts(summary)}. {_made_by(report)}."
     _write(path, "Tumors located from one depth image", words, body, data=data)
+
+
+def _made_by(report: dict[str, Any]) -> str:
+    """Method, version and date."""
+    origin = report.get("model", {})
+    method = "The default method" if "validation_tre_mm" in origin else "Another method"
+    if "steps" in origin:
+        method = f"The paper's method, an occupancy network: {training_words(origin)}"
+    return f"{method}; tumortrack {report['tumortrack']}, {date.today().isoformat()}"
 
 
 def _about(entry: dict[str, Any]) -> dict[str, Any]:

@@ -288,6 +288,24 @@ def scene_table(entries: list[Entry]) -> Table:
     return Table("", head, rows, caption)
 
 
+def side_by_side(methods: dict[str, list[Entry]]) -> Table:
+    """Several methods' answers to the same scenes: the verdict of each, how far off the farthest
+    tumor's middle and surface (Hausdorff) are, and the time."""
+    rows = []
+    for entries in zip(*methods.values(), strict=True):
+        row = [entries[0]["name"]]
+        for entry in entries:
+            surfaces = (part.get("hausdorff_mm") for part in judged_parts(entry["parts"]).values())
+            surface_mm = max(np.inf if mm is None else mm for mm in surfaces)
+            figures = worst_center(entry)[0], surface_mm, entry.get("seconds", np.inf)
+            shown = (f"{mm:.1f}" if np.isfinite(mm) else "-" for mm in figures)
+            row += [entry["quality"], *shown]
+        rows.append(row)
+    head = [column for name in methods for column in (name, "off", "HD", "s")]
+    caption = "off: a tumor's middle, HD: its surface (Hausdorff), at worst, mm; s: seconds"
+    return Table("", ["scene", *head], rows, caption)
+
+
 def baseline_center(entry: Entry, baseline: str, part: str) -> float | None:
     """How far off that rigid registration has the middle of a part, mm; None: it was not done."""
     parts = entry.get("baselines", {}).get(baseline, {}).get("parts", {})
