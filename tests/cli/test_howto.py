@@ -16,12 +16,14 @@ import pytest
 from stories import cloud_by_rays, looking_down
 from tumortrack.cli.main import run
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.mesh_query import contains
 from tumortrack.io.case import Case, load_case
 from tumortrack.io.ply import write_cloud_ply
 
 PAGES = sorted((Path(__file__).parents[2] / "docs" / "how-to").glob("*.md"))
 LEFT = {  # what a page's commands leave behind, besides what they print
     "camera": ("RUN/metadata.yaml", "again.json", "PACKED/metadata.yaml"),
+    "cut": ("RUN/report.json", "RUN/tumor_1.ply"),
     "ct": ("CASE/qc.png", "RUN/tumor_2.ply", "RUN_WITH_POINTS/points.csv"),
     "dvrk": ("frames.png",),
     "evaluate": ("REPORT/index.html",),
@@ -53,6 +55,15 @@ def write_touches(path: Path, case: Case) -> None:
     path.write_text("\n".join(["piece,frame,kind,x_mm,y_mm,z_mm,std_mm,tool", *rows]))
 
 
+def write_cut(path: Path, case: Case) -> None:
+    """Half way round a tumor, of the CT."""
+    tumor, organ = case.anatomy.tumors[0].vertices_mm[::8], case.anatomy.organ
+    places_ct = tumor.mean(0) + 1.3 * (tumor - tumor.mean(0))
+    places_ct = places_ct[contains(organ, places_ct) & (places_ct[:, 0] > tumor[:, 0].mean())]
+    rows = [f"1,ct,cut,{x:.2f},{y:.2f},{z:.2f},1.5" for x, y, z in places_ct]
+    path.write_text("\n".join(["piece,frame,kind,x_mm,y_mm,z_mm,kerf_mm", *rows]))
+
+
 @pytest.fixture
 def desk(tmp_path, page, phantom_case, elastic_model):
     """A reader's folder: a label map, a case and its model, a cloud, points of the CT."""
@@ -65,6 +76,7 @@ def desk(tmp_path, page, phantom_case, elastic_model):
         shutil.copytree(example, tmp_path, dirs_exist_ok=True)
     else:
         write_touches(tmp_path / "touches.csv", case)
+        write_cut(tmp_path / "cut.csv", case)
     points = case.anatomy.tumors[0].vertices_mm[:3]
     np.savetxt(tmp_path / "points.csv", points, delimiter=",", header="x,y,z", comments="")
     return tmp_path
