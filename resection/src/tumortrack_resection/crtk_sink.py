@@ -12,6 +12,8 @@ from tumortrack_devices.display import wxyz_of
 from tumortrack_devices.ros.bus import Via, check_topic, open_bus
 from tumortrack_devices.ros.crtk import POSE, pose_fields
 
+_FLUSH_S = 5.0  # a simulator on a busy machine takes so long for where the arm ends
+
 
 class CrtkSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="crtk"):
     """``servo_cp`` (PoseStamped) below ``namespace``: the tip's frame, which points along its x,
@@ -70,4 +72,5 @@ class CrtkSink:
         self.counts["sent" if self._sends else "would send"] += 1
 
     def close(self) -> None:
+        self._bus.flush(_FLUSH_S)
         self._bus.close()
