@@ -11,6 +11,7 @@ from tumortrack.live.values import SinkConfig, SinkContext, TrackingResult
 from tumortrack_devices.display import wxyz_of
 from tumortrack_devices.ros.bus import Via, check_topic, open_bus
 from tumortrack_devices.ros.crtk import POSE, pose_fields
+from tumortrack_resection.workcell import Workcell
 
 _FLUSH_S = 5.0  # a simulator on a busy machine takes so long for where the arm ends
 
@@ -41,8 +42,9 @@ class CrtkSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="crtk"):
 
 
 class CrtkSink:
-    """Sends with good answers alone, and nothing while the arms are halted or in a playback, which
-    knows no answer. It goes on from where the arms then are."""
+    """Sends while the arms move: with good answers, and on their way home once all is cut. Nothing
+    while they are halted or in a playback, which knows no answer. It goes on from where the arms
+    then are."""
 
     def __init__(self, config: CrtkSinkConfig) -> None:
         self._arm, self.counts = config.arm, Counter[str]()
@@ -56,7 +58,9 @@ class CrtkSink:
         cell = result.control
         if result.playback:
             raise TumortrackError("crtk sends nothing in a playback: give `resect` --live.")
-        if cell is None or cell.stopped or result.quality != "good":
+        # Once all is cut the arms go home, whatever is known of the organ.
+        known = result.quality == "good" or (isinstance(cell, Workcell) and cell.all_cut)
+        if cell is None or cell.stopped or not known:
             self.counts["halted" if cell and cell.stopped else "not good"] += 1
             return
         name = f"{self._arm}/tip"

@@ -231,6 +231,7 @@ class Operation:
             halt=halt,
             left_mm=None if now is None else now.left_mm,
             cutting=execution.cutting,
+            all_cut=execution.sweep > self.planned.plan.sweeps,
         )
 
     @property

@@ -23,11 +23,12 @@ class Workcell(ControlState):
     """``state``: of the procedure: approach, grasp, hold, sweep 1, ... ``halt``: why the arms have
     stopped early; None: they have not. ``left_mm``: what the present errors leave of the
     instrument's distance to the tumor that is the least safe; None: unknown. ``cutting``: the
-    instrument is on a cut."""
+    instrument is on a cut; ``all_cut``: none is left."""
 
     halt: Halt | None = None
     left_mm: float | None = None
     cutting: bool = False
+    all_cut: bool = False
 
 
 @runtime_checkable
