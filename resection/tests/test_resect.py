@@ -692,9 +692,12 @@ def place_of(said):
     return np.array(said["matrix"])[:3, 3]
 
 
+BEFORE_ALL_IS_CUT = "approach", "grasp", "hold", "pull", "taut", "sweep"
+
+
 def follows_the_arm(heard, recording, tip_mm):
     """A simulator was sent where the tip is by the joints of the same moment, in good results that
-    do not halt the arms, and in no others."""
+    do not halt the arms, or on their way home once all is cut, and in no others."""
     with AnyReader([recording]) as reader:
         wanted = {"/tumortrack/joint_states": {}, "/tumortrack/diagnostics": {}}
         connections = [c for c in reader.connections if c.topic in wanted]
@@ -707,7 +710,9 @@ def follows_the_arm(heard, recording, tip_mm):
         joint = dict(zip(at.name, at.position, strict=True))
         own = np.array([joint[name] for name in JOINTS if name.startswith("cutter")])
         np.testing.assert_allclose(place_of(said), tip_mm("cutter", own), atol=1e-3)
-        assert {status.level for status in states[said["stamp_ns"]].status} == {0}
+        answer, arms = states[said["stamp_ns"]].status[:2]
+        assert arms.level == 0
+        assert answer.level == 0 or not any(word in arms.message for word in BEFORE_ALL_IS_CUT)
     stopped = sum(states[at].status[1].level > 0 for at in states)
     assert 10 < len(heard) <= len(states) - stopped
     assert stopped  # the world lies elsewhere
