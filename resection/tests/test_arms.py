@@ -377,19 +377,19 @@ def test_arms_begin_anew_in_the_middle_of_a_cut(cell, made, share):
     config = OURS if plan.method == "margin" else PUBLISHED
     like = plan if len(plan.facets) else None
     there = seen((0.0, 3.0, 0.0))
-    again, anew = plan_motions(there, config, CONFIG, Start(middle, 1), like)
-    assert [stage.name for stage in anew.stages] == [Stage.WITHDRAW, *sweeps(again), *LAST]
-    joints = anew.stages[0].joints_rad
+    again, later = plan_motions(there, config, CONFIG, Start(middle, 1), like)
+    assert [stage.name for stage in later.stages] == [Stage.WITHDRAW, *sweeps(again), *LAST]
+    joints = later.stages[0].joints_rad
     assert np.array_equal(joints[0], middle)
-    for stage in anew.stages[: 1 + again.sweeps]:  # it holds
+    for stage in later.stages[: 1 + again.sweeps]:  # it holds
         assert np.ptp(stage.joints_rad[:, 6:], axis=0).max() == 0
     assert is_straight_back(cell, joints)
-    assert not anew.stages[0].cutting.any()
+    assert not later.stages[0].cutting.any()
     tip = cell.tips(joints[-1])[CUTTER]
     along = tip[:3, 3] - np.outer(np.arange(0.0, 70.0, 1.0), tip[:3, 0])
     assert cKDTree(there.organ.spread_mm(1.0)).query(along)[0].min() > CONFIG.organ_clearance_mm
     assert np.array_equal(again.facets[:, :3], plan.facets[:, :3])
-    checked(again, anew, body.cell_urdf(CONFIG), there)
+    checked(again, later, body.cell_urdf(CONFIG), there)
 
 
 def grooved(located: Located, planes: np.ndarray, number: int, kerf_mm: float = 2.4) -> Located:
@@ -406,19 +406,19 @@ def test_what_is_cut_stays_cut_and_the_rest_is_planned_on_the_organ_with_its_gro
     plan, motions = ours
     first, open_ = sweeps(plan)[0], grooved(seen(), plan.facets, 1)
     end = next(stage for stage in motions.stages if stage.name == first).joints_rad[-1]
-    again, anew = plan_motions(open_, OURS, CONFIG, Start(end, 2), plan)
-    assert [stage.name for stage in anew.stages] == [*sweeps(plan)[1:], *LAST]
+    again, later = plan_motions(open_, OURS, CONFIG, Start(end, 2), plan)
+    assert [stage.name for stage in later.stages] == [*sweeps(plan)[1:], *LAST]
     assert np.array_equal(again.facets[:, :3], plan.facets[:, :3])
     assert np.array_equal(again.cuts[0].path_mm, plan.cuts[0].path_mm)
     assert np.array_equal(again.grasp_mm, plan.grasp_mm)  # the cup stays where it holds
     assert np.array_equal(again.lift, plan.lift)
-    kept = checked(again, anew, body.cell_urdf(CONFIG), open_).least_mm["tumor_1"]
+    kept = checked(again, later, body.cell_urdf(CONFIG), open_).least_mm["tumor_1"]
     assert kept > OURS.margin_mm - TOLERANCE_MM
     # Its sweep had not ended: there is nothing left to cut of it, and it is gone past at once.
-    _, anew = plan_motions(open_, OURS, CONFIG, Start(end, 1), plan)
-    assert [stage.name for stage in anew.stages] == [*sweeps(plan), *LAST]
-    assert anew.stages[0].seconds == 0
-    execution = Execution(anew)
+    _, later = plan_motions(open_, OURS, CONFIG, Start(end, 1), plan)
+    assert [stage.name for stage in later.stages] == [*sweeps(plan), *LAST]
+    assert later.stages[0].seconds == 0
+    execution = Execution(later)
     assert (execution.sweep, execution.holds) == (1, True)
     execution.step(0.1)
     assert execution.sweep == 2
@@ -472,14 +472,14 @@ def test_arms_that_do_not_hold_yet_begin_from_wherever_they_are(cell, made):
         (motions.stages[2].joints_rad[0], FIRST),
         (motions.stages[0].joints_rad[len(motions.stages[0].times_s) // 2], FIRST),
     ):
-        again, anew = plan_motions(there, config, CONFIG, Start(start))
-        assert [stage.name for stage in anew.stages] == [*first, *sweeps(again), *LAST]
-        assert np.array_equal(anew.stages[0].joints_rad[0], start)
-        held = cell.tips(anew.stages[first.index("hold")].joints_rad[0])[HOLDER]
+        again, later = plan_motions(there, config, CONFIG, Start(start))
+        assert [stage.name for stage in later.stages] == [*first, *sweeps(again), *LAST]
+        assert np.array_equal(later.stages[0].joints_rad[0], start)
+        held = cell.tips(later.stages[first.index("hold")].joints_rad[0])[HOLDER]
         assert np.abs(held[:3, 3] - again.grasp_mm).max() < 0.01
-        for one, other in itertools.pairwise(anew.stages):
+        for one, other in itertools.pairwise(later.stages):
             assert np.array_equal(one.joints_rad[-1], other.joints_rad[0])
-        checked(again, anew, body.cell_urdf(CONFIG), there)
+        checked(again, later, body.cell_urdf(CONFIG), there)
 
 
 @pytest.mark.parametrize(

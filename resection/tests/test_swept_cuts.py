@@ -1,4 +1,4 @@
-"""What the electrode cuts is told to the tracker: all of its line, once, while it is energised."""
+"""The tracker hears what the electrode cuts: all of its line, once, while it is energised."""
 
 from __future__ import annotations
 

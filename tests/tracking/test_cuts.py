@@ -127,9 +127,7 @@ def test_what_is_cut_again_and_air_add_nothing(tracker, follower, shell):
         again = [cut(shell[n::20]), Cut(places_mm=tuple(map(tuple, air.tolist())))]
         follower.locate(seen(there, 1.1 + n / 30), evidence=again)
     assert follower.cuts.known == known
-    first = [each.points_ct for each in follower.cuts.all]
-    assert len(first) == 1  # of one tool
-    cubes = np.floor(np.array(first[0]) / 1.5)
+    cubes = np.floor(np.array(follower.cuts.all.points_ct) / 1.5)
     assert len(np.unique(cubes, axis=0)) == known
 
 
@@ -140,7 +138,7 @@ def test_a_cut_is_carried_by_where_the_organ_lay(tracker, follower, shell):
         follower = Follower(tracker, FollowerConfig())
         follower.locate(seen(there, 1 + n))
         follower.locate(seen(there, 1.1 + n), evidence=[cut(shell, there)])
-        places.append(np.array(follower.cuts.all[0].points_ct))
+        places.append(np.array(follower.cuts.all.points_ct))
     for one in places:
         off_mm = np.linalg.norm(one[:, None] - shell, axis=2).min(1)
         assert np.percentile(off_mm, 95) < 2.0  # as far as the answer errs

@@ -13,7 +13,7 @@ from tumortrack_devices.ros.bus import Via, check_topic, open_bus
 from tumortrack_devices.ros.crtk import POSE, pose_fields
 from tumortrack_resection.workcell import Workcell
 
-_FLUSH_S = 5.0  # a simulator on a busy machine takes so long for where the arm ends
+_FLUSH_S = 5.0  # at most, for a busy simulator to take where the arm ends
 
 
 class CrtkSinkConfig(SinkConfig, frozen=True, kw_only=True, tag="crtk"):

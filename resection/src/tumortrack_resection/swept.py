@@ -14,12 +14,12 @@ from tumortrack_resection.budget import ErrorBudget
 from tumortrack_resection.motions import CUTTER, Execution, Joints
 
 Line = Float64[np.ndarray, "2 3"]  # tip and rear end of the bare electrode's axis, mm
-_APART_MM = 1.0  # between places that are told
+_APART_MM = 1.0  # between places
 
 
 class Swept:
     """All of an electrode's bare length cuts. ``line_mm``: from both arms' joints to its axis,
-    published frame. ``budget``: its bounds count as three standard deviations. Each place is told
+    published frame. ``budget``: its bounds count as three standard deviations. Each place comes
     once, with the next frame."""
 
     def __init__(

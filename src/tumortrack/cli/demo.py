@@ -34,7 +34,7 @@ class Demo:
         scenes: the first so many of the ten.
         preset: quick and paper show the paper's network beside it, on the same CT and scenes
             (OUT/paper), and plan a resection on its labelled volume of 400 x 400 x 400.
-        minutes: train that network anew, for so long once kernels are compiled (default: quick has
+        minutes: train that network first, for so long once kernels are compiled (default: quick has
             weights that come with it; paper 3).
     """
 

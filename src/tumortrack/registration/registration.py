@@ -4,7 +4,7 @@
 2. Fit (`gauss_newton`): from the best of these the elastic body's surface is fitted to the points,
    with a robust kernel; and again from starts beside the best fit, turned where its turn is least
    certain: one side leaves the turn about the organ's long axis nearly free, and there are local
-   minima on the way.
+   minima on the way. Of an organ that is cut (`flap`) also with its flap moved.
 3. Correct (`multi_view`): where there are several cameras, their places and the motion in turns.
 4. Choose (`select_best`, below): by cost, and by how the organ may lie, which the case says. Other
    minima that explain the points nearly as well, and put a tumor elsewhere, are kept as
@@ -12,8 +12,7 @@
    poor.
 5. Verdict (`registration.in_distribution`): what cannot be this organ is refused.
 6. Compliance (`compliance`): what the library's states cannot follow, the body's compliance does;
-with it, what
-   points and evidence leave open.
+   with it, what points and evidence leave open.
 
 The result is a motion (`motion`): any point of the CT, carried to the camera's frame and back, with
 its uncertainty. `estimate` makes surfaces, labels and a report of it.

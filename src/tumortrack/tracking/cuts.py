@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
@@ -31,14 +30,6 @@ _SURE_MM = 2.0  # of an answer that is too unsure to be good: a shift of cuts th
 _EVERY_NS, _RESTED_NS = 3_000_000_000, 500_000_000  # a tracker is made so often, or after a leg
 
 
-@dataclass
-class _OfTool:
-    """Of one tool: a place in each cube, and the widest of its kerfs."""
-
-    places_ct: dict[Any, Point] = field(default_factory=dict)
-    kerf_mm: float = 0.0
-
-
 class Cuts:
     """Of one organ, from the start of its tracker. ``beside``: new trackers are made while frames
     go on; else the frame waits, and a replay gives the same."""
@@ -46,7 +37,7 @@ class Cuts:
     def __init__(self, tracker: Tracker, beside: bool = False) -> None:
         self.beside, self.trouble = beside, ""
         self._first, self._pool = tracker, ThreadPoolExecutor(1, "cuts")
-        self._tools = dict[str, _OfTool]()
+        self._places_ct, self._kerf_mm = dict[Any, Point](), 0.0  # a place in each cube
         # Since when, in the frame of the last estimate: no estimate has said yet where they are.
         self._waiting = list[tuple[int, Cut, Points]]()
         self._told, self._carried, self._lost = False, 0, 0
@@ -62,7 +53,7 @@ class Cuts:
     @property
     def known(self) -> int:
         """How many places of cuts."""
-        return sum(len(tool.places_ct) for tool in self._tools.values())
+        return len(self._places_ct)
 
     @property
     def finding(self) -> Finding | None:
@@ -158,26 +149,23 @@ class Cuts:
         points_ct = points_ct[shape.distances_mm(points_ct, 0) < _AIR_MM]
         if not len(points_ct):
             return
-        tool, before, self._told = self._tools.setdefault(cut.tool, _OfTool()), self.known, False
-        tool.kerf_mm = max(cut.kerf_mm, tool.kerf_mm)
+        before, self._told = self.known, False
+        self._kerf_mm = max(cut.kerf_mm, self._kerf_mm)
         cubes = map(tuple, np.floor(points_ct / _APART_MM).astype(int).tolist())
         for cube, point in zip(cubes, map(tuple, points_ct.tolist()), strict=True):
-            tool.places_ct.setdefault(cube, point)
+            self._places_ct.setdefault(cube, point)
         if self.known > before:
             self._newest_ns = stamp_ns
             self._since_ns = stamp_ns if before == self._asked else self._since_ns
 
     @property
-    def all(self) -> tuple[Cut, ...]:
-        """What is known, of each tool, in places of the CT."""
-        return tuple(
-            Cut(points_ct=tuple(of.places_ct.values()), kerf_mm=of.kerf_mm, tool=tool)
-            for tool, of in self._tools.items()
-        )
+    def all(self) -> Cut:
+        """What is known, in places of the CT."""
+        return Cut(points_ct=tuple(self._places_ct.values()), kerf_mm=self._kerf_mm)
 
 
-def _made(tracker: Tracker, cuts: Sequence[Cut]) -> Tracker:
-    made = tracker.with_cut(cuts)
+def _made(tracker: Tracker, cut: Cut) -> Tracker:
+    made = tracker.with_cut([cut])
     made.warm()
     return made
 

@@ -40,6 +40,7 @@ from tumortrack.tracking.model_files import case_model
 from tumortrack.tracking.pieces import select_piece, with_flap_joined
 
 _DEFAULTS = FollowOptions()
+_GRID = 16  # of an answer of which the motion alone counts
 _BEFORE_MM = np.array([0.0, 0.0, 300.0])  # of a camera that there is not
 _FARTHEST_MM = 700.0  # of an organ before a camera on a stand
 
@@ -127,7 +128,7 @@ class Tracker:
                 "grid": grid, "frame": frame,
             }  # fmt: skip
             if not all(cut.points_ct for cut in cuts):  # made just now, with the organ as it lies
-                motion = self.locate(cloud, **known).motion
+                motion = self.locate(cloud, **known | {"grid": _GRID}).motion
                 assert isinstance(motion, ElasticMotion)
                 cuts = carried_to_ct(cuts, motion)
             return self.with_cut(cuts).locate(cloud, **known)
