@@ -142,8 +142,8 @@ def main(options: Options) -> None:
     if options.only_make:
         return
     rows = pd.DataFrame([row for folder in folders for row in _measured(folder)])
-    tables = {f"cut-{options.plan}": table(rows), f"cut-{options.plan}-rows": rows}
-    print(table_of(tables[f"cut-{options.plan}"]))
+    tables = {f"cut-{options.plan}": table(rows)}
+    print(table_of(*tables.values()))
     writer.tables(tables, sample=f"{len(folders)} organs, {rows.scene.nunique()} scenes")
     path = options.out / "share.png" if options.document is None else writer.image("cut-share")
     picture(rows, path)
