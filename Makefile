@@ -24,7 +24,7 @@ COMPILER = $(BIN)/python tools/build_backend.py --compiler >/dev/null 2>&1 || { 
 NO_COMPILER = $(BIN)/pip uninstall --quiet --yes ziglang 2>/dev/null
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian clients demo demo-scenes test quick pythons pytest test-hard check attack replay fingerprint figures bench soak wheel lock licences audit stress pull bounds evidence cut ultrasound noise rehearsal population site pictures clean
+.PHONY: help setup debian clients demo demo-scenes test quick pythons pytest test-hard check attack replay fingerprint figures bench soak wheel lock licences audit stress pull bounds evidence cut paper ultrasound noise rehearsal population site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -144,6 +144,9 @@ evidence: setup  ## what touches, outlines, landmarks and held tumors bring, on 
 
 cut: setup  ## how well a tumor is followed while it is cut out of random kidneys (ARGS="OUT --organs 14"; hours)
 	$(BIN)/python benchmarks/scripts/cut.py $(ARGS)
+
+paper: setup  ## the paper's table and its study of deformations, on the twin (ARGS="CASE OUT --limited MODEL --full MODEL")
+	$(BIN)/python benchmarks/scripts/paper.py $(ARGS)
 
 population: setup  ## KiTS19's kidneys with tumors: their list for a fleet, and what came of it (ARGS="DATA --list FILE", then --fleet OUT)
 	$(BIN)/python benchmarks/scripts/population.py $(ARGS)

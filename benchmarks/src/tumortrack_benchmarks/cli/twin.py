@@ -35,10 +35,10 @@ class Twin:
         """Make what is missing of these states and views; empty means all. Raises InputError: no
         case, unknown names, or scenes made from something else."""
         with live_line("starting ...") as report:
-            from tumortrack_benchmarks.physics.twin import VARIANTS, VIEWS, make_scenes
+            from tumortrack_benchmarks.physics.twin import USUAL, VIEWS, make_scenes
 
             made = make_scenes(
-                self.case, self.scenes, self.states or tuple(VARIANTS), self.views or VIEWS,
+                self.case, self.scenes, self.states or USUAL, self.views or VIEWS,
                 self.seed, report,
             )  # fmt: skip
         say(f"{len(made)} scenes in {self.scenes}; look at the scene.png in each.")

@@ -82,6 +82,11 @@ class Variant(NamedTuple):
 VARIANTS = {name: Variant(name) for name in ("D0", "D1", "D2", "D3")}
 VARIANTS |= {f"Rot{turn}": Variant("D0", turn) for turn in (90, 180, 270)}
 VARIANTS |= {name: Variant(name) for name in ("G1", "P1")}
+USUAL = tuple(VARIANTS)
+TURNED = {
+    f"{state}Rot{turn}": Variant(state, turn) for state in COMPRESSION_MM for turn in (90, 180, 270)
+}
+VARIANTS |= TURNED
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,7 +287,7 @@ def make_scene(bench: Bench, state: Deformed, name: str, view: View, seed: int) 
 def make_scenes(
     case_folder: Path,
     out: Path,
-    variants: Sequence[str] = tuple(VARIANTS),
+    variants: Sequence[str] = USUAL,
     views: Sequence[View] = VIEWS,
     seed: int = 0,
     report: Callable[[str], None] = lambda text: None,
