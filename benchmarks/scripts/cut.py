@@ -9,6 +9,7 @@ after a change of the method everything is measured again. No patient's anatomy 
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,14 +19,16 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import pandas as pd
 import tyro
+from PIL import Image
 from scipy.ndimage import binary_dilation, gaussian_filter
 from scipy.spatial import cKDTree
 
 import tumortrack as tt
 from tumortrack import registration
-from tumortrack.core import store
+from tumortrack.core import colours, store
 from tumortrack.core.cloud import CloudConfig, cloud_from_depth
 from tumortrack.core.errors import NoEstimate, TumortrackError
+from tumortrack.core.estimate import Estimate
 from tumortrack.core.evidence import Cut, Evidence, Grasp
 from tumortrack.core.geometry import perpendicular, transform_points, turned_by, unit
 from tumortrack.core.mesh_query import surface_distance
@@ -38,6 +41,8 @@ from tumortrack.io.mesh_files import write_anatomy
 from tumortrack.registration.frame import estimate_of
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.report import drawing
+from tumortrack.report.pictures import scene_views, write_sheet
+from tumortrack.tracking.follower import Follower, FollowerConfig
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_benchmarks import scripting
 from tumortrack_benchmarks.document import table_of
@@ -72,6 +77,11 @@ _LEAST_SEEN, _VIEWS = 0.4, 20  # of the organ's pixels, before smoke; views amon
 _MOST, _STEPS = 0.85, 7  # of the surface that is cut; states of a sequence
 _WRONG_MM = 5.0
 _ASIDE_MM = 4.0  # of all places of a cut, any way, as a hand-eye calibration errs
+# Frames of each state of a sequence: the first has what was cut, and the next, once no more comes,
+# a body that knows it.
+_FRAMES_S = (0.0, 0.7, 0.9, 1.1)
+_STEP_S = 1.5
+_FILM_MS = 350  # a frame's
 _COLOURS = {"nothing": "#b2182b", "the cut": "#2166ac", "both": "#67a9cf"}
 
 
@@ -141,12 +151,15 @@ def main(options: Options) -> None:
         number += 1
     if options.only_make:
         return
-    rows = pd.DataFrame([row for folder in folders for row in _measured(folder)])
+    rows = pd.DataFrame([row for folder in folders for row in _measured(folder, options.plan)])
     tables = {f"cut-{options.plan}": table(rows)}
     print(table_of(*tables.values()))
     writer.tables(tables, sample=f"{len(folders)} organs, {rows.scene.nunique()} scenes")
     path = options.out / "share.png" if options.document is None else writer.image("cut-share")
-    picture(rows, path)
+    if options.plan == "many":
+        picture(rows, path)
+    else:
+        film(folders[0], path.with_name("cut.gif"))
 
 
 def make(folder: Path, number: int, plan: str) -> None:
@@ -290,8 +303,8 @@ def _holes(
     return lost
 
 
-def _measured(folder: Path) -> list[dict[str, Any]]:
-    """A row for each scene and what was told."""
+def _measured(folder: Path, plan: str) -> list[dict[str, Any]]:
+    """A row for each scene, or each frame of a sequence, and what was told."""
     scenes = [path for path in scene_folder.list_scenes(folder) if (path / "held.json").exists()]
 
     def measure() -> Iterator[dict[str, Any]]:
@@ -302,47 +315,118 @@ def _measured(folder: Path) -> list[dict[str, Any]]:
             for row in _rows(tracker, scene_folder.read_scene(path), known):
                 yield {**about, **row}
 
+    def follow() -> Iterator[dict[str, Any]]:
+        tracker = scripting.tracker_of(folder / "case")
+        for look in LOOKS["sequence"]:
+            steps = [path for path in scenes if path.name.endswith(f"-{look}")]
+            for told in ("nothing", "the cut", "both"):
+                for frame, (scene, found) in enumerate(_followed(tracker, steps, told)):
+                    about, mine = _about(tracker, scene)
+                    about |= {"organ": folder.name, "scene": f"{folder.name}/{look}", "told": told}
+                    yield {**about, "frame": frame, **_judged(found, scene, mine)}
+
     # The method's fingerprint is of intact organs.
     code = scripting.code_sha256(Path(registration.__path__[0]).glob("*.py"))
     about = {"scenes": [path.name for path in scenes], "registration": code}
-    return scripting.kept(folder / "rows.json", about, measure)
+    return scripting.kept(folder / "rows.json", about, follow if plan == "sequence" else measure)
+
+
+def _followed(
+    tracker: Tracker, steps: list[Path], told: str
+) -> Iterator[tuple[scene_folder.Scene, Estimate | None]]:
+    """Frame by frame, from the organ as it is in the CT; once it is cut they are handed on."""
+    follower = Follower(tracker, FollowerConfig())
+    for step, path in enumerate(steps):
+        scene, (*cuts, held) = scene_folder.read_scene(path), read_evidence(path / "held.json")[1]
+        for frame, after_s in enumerate(_FRAMES_S):
+            stamp_ns = round(1e9 * (1 + step * _STEP_S + after_s))
+            new = (*([] if frame else cuts), *([held] if told == "both" else []))
+            try:
+                found = follower.locate(
+                    replace(scene.cloud, stamp_ns=stamp_ns), scene.depth,
+                    evidence=() if told == "nothing" else new,
+                )  # fmt: skip
+            except NoEstimate:
+                found = None
+            if cuts:
+                yield scene, found
+
+
+def film(folder: Path, path: Path) -> None:
+    """A sequence as it is followed with cut and hold told, over the truth: an animated GIF."""
+    steps = [each for each in scene_folder.list_scenes(folder) if each.name.endswith("-bare")]
+    tracker, pictures = scripting.tracker_of(folder / "case"), list[Image.Image]()
+    legend = {"tumor, estimated": colours.name_colour("tumor_1"), "truth (outline)": colours.TRUTH,
+              "observed points": colours.SEEN}  # fmt: skip
+    with TemporaryDirectory() as aside:
+        for scene, found in _followed(tracker, steps, "both"):
+            _, mine = _about(tracker, scene)
+            off_mm = _judged(found, scene, mine)["off_mm"]
+            said = (
+                "no estimate" if found is None else f"{found.quality}, centre {off_mm:.1f} mm off"
+            )
+            state = (
+                f"{scene.meta['share']:.0%} cut, lifted {scene.meta['lift_mm']:.1f} mm, SIMULATED"
+            )
+            meshes = {} if found is None else found.meshes
+            colour = colours.VERDICTS["none" if found is None else found.quality]
+            sheet = Path(aside) / "sheet.png"
+            views = scene_views(scene, meshes)
+            write_sheet(sheet, [(said, colour)], [state], legend, [views], width=900)
+            pictures.append(Image.open(sheet).convert("P", palette=Image.Palette.ADAPTIVE))
+    stream, more = io.BytesIO(), {"append_images": pictures[1:], "duration": _FILM_MS, "loop": 0}
+    pictures[0].save(stream, format="GIF", save_all=True, **more)
+    store.write_atomically(path, stream.getvalue())
+
+
+def _about(tracker: Tracker, scene: scene_folder.Scene) -> tuple[dict[str, Any], np.ndarray]:
+    """What a row says of a scene, and which of its targets are of the tumor that is cut out."""
+    assert scene.targets is not None
+    assert isinstance(tracker.model, RegistrationModel)
+    part = scene.meta["tumor"]
+    mine = scene.targets.labels == 1 + scene.reference.names.index(part)
+    keys = ("state", "share", "lift_mm", "degrees", "exophytic", "surface", "cup", "smoke")
+    about = {key: scene.meta[key] for key in (*keys, "tumor_moved_mm", "flap_turned_degrees")}
+    return {**about, "rigid_mm": rigid_centers_mm(tracker.model, scene)[part]}, mine
+
+
+def _judged(found: Estimate | None, scene: scene_folder.Scene, mine: np.ndarray) -> dict[str, Any]:
+    """How far the tumor's centre is off, and what was said of it."""
+    if found is None:
+        return {"quality": "none", "off_mm": None, "radius_mm": None}
+    targets, motion = scene.targets, found.motion
+    assert targets is not None
+    assert motion is not None
+    off_mm = (motion.forward(targets.points_ct[mine]) - targets.points_mm[mine]).mean(0)
+    bound = found.assessment.bounds.get(scene.meta["tumor"])
+    return {
+        "quality": found.quality, "off_mm": float(np.linalg.norm(off_mm)),
+        "radius_mm": None if bound is None else bound.error_bound95_mm,
+    }  # fmt: skip
 
 
 def _rows(
     tracker: Tracker, scene: scene_folder.Scene, known: tuple[Evidence, ...]
 ) -> Iterator[dict[str, Any]]:
-    meta, targets, model = scene.meta, scene.targets, tracker.model
-    assert targets is not None
-    assert isinstance(model, RegistrationModel)
-    part = meta["tumor"]
-    mine = targets.labels == 1 + scene.reference.names.index(part)
-    keys = ("state", "share", "lift_mm", "degrees", "exophytic", "surface", "cup", "smoke")
-    about = {key: meta[key] for key in (*keys, "tumor_moved_mm", "flap_turned_degrees")}
-    about |= {"rigid_mm": rigid_centers_mm(model, scene)[part]}
+    about, mine = _about(tracker, scene)
     cuts = [each for each in known if isinstance(each, Cut)]
     cut = tracker.with_cut(cuts) if cuts else tracker
     told = {
         "nothing": (tracker, ()), "the hold": (tracker, known[-1:]),
         "the cut": (cut, ()), "both": (cut, known[-1:]),
     }  # fmt: skip
-    if cuts and meta["state"] == "most-10":
+    if cuts and about["state"] == "most-10":
         points_ct = np.array(cuts[0].points_ct)
         aside = _ASIDE_MM * unit(np.random.default_rng(len(points_ct)).normal(size=3))
         wrong = {f"the cut, {_ASIDE_MM:g} mm aside": points_ct + aside,
                  "a third of the cut": points_ct[::3]}  # fmt: skip
         told |= {n: (tracker.with_cut([cuts[0].of_ct(p)]), ()) for n, p in wrong.items()}
     for name, (using, evidence) in told.items():
-        row: dict[str, Any] = {**about, "told": name, "quality": "none"}
         try:
             found = using.locate(scene.cloud, grid=16, full_view=scene.depth, evidence=evidence)
         except NoEstimate:
-            yield {**row, "off_mm": None, "radius_mm": None}
-            continue
-        assert found.motion is not None
-        off_mm = (found.motion.forward(targets.points_ct[mine]) - targets.points_mm[mine]).mean(0)
-        bound = found.assessment.bounds.get(part)
-        row |= {"quality": found.quality, "off_mm": float(np.linalg.norm(off_mm))}
-        yield {**row, "radius_mm": None if bound is None else bound.error_bound95_mm}
+            found = None
+        yield {**about, "told": name, **_judged(found, scene, mine)}
 
 
 def table(rows: pd.DataFrame) -> pd.DataFrame:
@@ -355,6 +439,10 @@ def table(rows: pd.DataFrame) -> pd.DataFrame:
         "along planes": rows.surface != "shell", "smoke and blood": rows.smoke > 0,
         "nothing cut": rows.share == 0,
     }  # fmt: skip
+    if "frame" in rows:
+        half = rows.share <= 0.5
+        families = {"all frames": rows.share >= 0, "up to half cut": half, "more": ~half,
+                    "cup in view": rows.cup}  # fmt: skip
     groups = {name: rows[chosen].groupby("told", sort=False) for name, chosen in families.items()}
     return pd.DataFrame(
         [_line(name, told, some) for name, group in groups.items() for told, some in group]
