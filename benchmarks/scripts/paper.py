@@ -1,6 +1,6 @@
 """The paper's table and its study of deformations, on the twin: how far off its method is here.
 
-    make paper ARGS='CASE OUT --limited MODEL --full MODEL --document docs/paper.md'
+    make paper ARGS='runs/demo/case OUT --document docs/paper.md'   (half an hour, after make demo)
 
 Makes the twin's scenes of CASE in OUT/scenes and evaluates both models and the default method in
 them; then, on a random kidney in OUT/second, trains and evaluates a short network for each of the
@@ -22,6 +22,7 @@ import pandas as pd
 import tyro
 
 import tumortrack as tt
+import tumortrack_occupancy
 from tumortrack.cli.console import live_line, progress_bar
 from tumortrack.core import store
 from tumortrack.core.mesh_query import surface_distance
@@ -39,7 +40,9 @@ from tumortrack_benchmarks.physics.twin import TURNED, VARIANTS, VIEWS, make_sce
 from tumortrack_benchmarks.scripting import cell
 from tumortrack_occupancy import presets
 
+_SHIPPED = Path(tumortrack_occupancy.__path__[0]) / "phantom"
 _PRESSED, _TURNED = ("D1", "D2", "D3"), ("Rot90", "Rot180", "Rot270")
+_HISTORY = "training/history.jsonl"
 _FINEST = 400  # voxels along the longest side, the paper's
 _BARE_MM, _BARE = 0.7, 0.1  # a tumor is free so near to the organ's surface; share: exophytic
 _SECOND = 1  # the first random kidney with two tumors, from this number on
@@ -69,9 +72,9 @@ class Options:
     """Folder that `prepare` wrote."""
     out: tyro.conf.Positional[Path]
     """Folder of scenes, rows and short trainings."""
-    limited: Path
-    """A model of limited rotations, M_lim, of the same case."""
-    full: Path
+    limited: Path = _SHIPPED / "limited"
+    """A model of limited rotations, M_lim, of the same case; default: the built-in phantom's."""
+    full: Path = _SHIPPED / "full"
     """One of all rotations, M_full."""
     grid: int = _FINEST
     """Voxels along the longest side."""
@@ -98,10 +101,13 @@ def main(options: Options) -> None:
     ])  # fmt: skip
     rows["kind"] = rows.part.map(kinds)
     tables = {"paper": table(rows), "paper-overlap": overlap(rows)}
-    curves = {name: history(models[name]) for name in _COLOURS}
-    tables["paper-training"] = pd.concat(
-        [some.assign(model=_NAMES[name])[["model", *some]] for name, some in curves.items()]
-    )
+    curves = {
+        name: history(models[name]) for name in _COLOURS if (models[name] / _HISTORY).exists()
+    }
+    if curves:  # weights that come with the package have none
+        tables["paper-training"] = pd.concat(
+            [some.assign(model=_NAMES[name])[["model", *some]] for name, some in curves.items()]
+        )
     if options.study_steps:
         study = pd.DataFrame(list(_study(out / "second", options.study_steps)))
         tables["paper-deformations"] = strength(study)
@@ -111,7 +117,8 @@ def main(options: Options) -> None:
     def image(name: str) -> Path:
         return out / f"{name}.png" if options.document is None else writer.image(name)
 
-    draw_curves(curves, image("paper-training"))
+    if curves:
+        draw_curves(curves, image("paper-training"))
     if options.study_steps:
         draw_strength(study, image("paper-deformations"))
 
@@ -193,7 +200,7 @@ def overlap(rows: pd.DataFrame) -> pd.DataFrame:
 
 def history(model: Path) -> pd.DataFrame:
     """Of a training: its validations."""
-    text = (model / "training/history.jsonl").read_text(encoding="utf-8")
+    text = (model / _HISTORY).read_text(encoding="utf-8")
     rows = pd.DataFrame(map(json.loads, text.splitlines()))
     return pd.DataFrame({
         "step": rows.step, "minutes": (rows.elapsed_s / 60).round(1),

@@ -85,8 +85,8 @@ class OccupancyMethod:
 
         return OccupancyModel.from_folder(folder, manifest, device=device, **known)
 
-    def phantom_model(self, preset: str) -> Path | None:
-        folder = Path(__file__).with_name("phantom")
+    def phantom_model(self, preset: str, rotations: Rotations = "limited") -> Path | None:
+        folder = Path(__file__).with_name("phantom") / rotations
         return folder if preset == "quick" else None
 
     def locator(self, model: Model) -> Locator:

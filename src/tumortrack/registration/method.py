@@ -104,7 +104,9 @@ class Method(Protocol):
         already. InputError, KeyError, ValueError, RuntimeError or OSError: the folder is
         incomplete."""
 
-    def phantom_model(self, preset: str) -> Path | None:
+    def phantom_model(
+        self, preset: str, rotations: Literal["limited", "full"] = "limited"
+    ) -> Path | None:
         """The folder of a model of the built-in phantom that the package brings, for a preset."""
 
     def locator(self, model: Model) -> Locator:
