@@ -152,13 +152,13 @@ def main(options: Options) -> None:
     if options.only_make:
         return
     rows = pd.DataFrame([row for folder in folders for row in _measured(folder, options.plan)])
-    tables = {f"cut-{options.plan}": table(rows)}
-    print(table_of(*tables.values()))
+    every = table(rows)
+    tables = {f"cut-{options.plan}": every, f"cut-{options.plan}-short": beside(every)}
+    print(*map(table_of, tables.values()), sep="\n\n")
     writer.tables(tables, sample=f"{len(folders)} organs, {rows.scene.nunique()} scenes")
-    path = options.out / "share.png" if options.document is None else writer.image("cut-share")
-    if options.plan == "many":
+    if options.plan == "sequence":
+        path = options.out / "share.png" if options.document is None else writer.image("cut-share")
         picture(rows, path)
-    else:
         film(folders[0], path.with_name("cut.gif"))
 
 
@@ -462,17 +462,32 @@ def _line(family: str, told: Any, some: pd.DataFrame) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def beside(lines: pd.DataFrame) -> pd.DataFrame:
+    """What was told, side by side: median / 95 % / worst, mm, and how many answers were good."""
+    shown = []
+    for family, some in lines.groupby("family", sort=False):
+        by = some.set_index("told").loc[list(_COLOURS)]
+        errors = by[["median, mm", "95 %", "worst"]].agg(" / ".join, axis=1)
+        rigid = by[["rigid fit: median, mm", "its 95 %"]].agg(" / ".join, axis=1)
+        shown.append({
+            "family": family, "answers": by.scenes.iloc[0],
+            **{f"told: {told}": error for told, error in errors.items()},
+            "rigid fit": rigid.iloc[0],
+            **{f"good %: {told}": good for told, good in by["good %"].items()},
+        })  # fmt: skip
+    return pd.DataFrame(shown)
+
+
 def picture(rows: pd.DataFrame, path: Path) -> None:
-    """Errors over the share that is cut: a dot each, and medians by steps of a tenth."""
+    """Errors over the share that is cut: median and 95 % of all sequences' frames."""
     figure = drawing.new_figure(7.0, 4.2, left=0.1, right=0.97, top=0.95, bottom=0.14)
     axes = figure.add_subplot()
     for told, colour in _COLOURS.items():
-        some = rows[rows.told == told]
-        axes.plot(some.share, some.off_mm, ".", ms=3, alpha=0.4, color=colour)
-        medians = some.groupby(some.share.round(1)).off_mm.median()
-        axes.plot(medians.index, medians, color=colour, label=f"told: {told}")
+        steps = rows[rows.told == told].groupby(rows.share.round(2)).off_mm
+        for share, label, style in ((0.5, f"told: {told}, median", "-"), (0.95, "95 %", "--")):
+            axes.plot(steps.quantile(share), style, color=colour, marker=".", label=label)
     axes.set(xlabel="share that is cut", ylabel="error of the tumor's centre, mm", ylim=(0, None))
-    axes.legend(frameon=False)
+    axes.legend(frameon=False, ncols=3)
     drawing.save(figure, path)
 
 
