@@ -471,9 +471,9 @@ def beside(lines: pd.DataFrame) -> pd.DataFrame:
         rigid = by[["rigid fit: median, mm", "its 95 %"]].agg(" / ".join, axis=1)
         shown.append({
             "family": family, "answers": by.scenes.iloc[0],
-            **{f"told: {told}": error for told, error in errors.items()},
+            **{f"told {told}": error for told, error in errors.items()},
             "rigid fit": rigid.iloc[0],
-            **{f"good %: {told}": good for told, good in by["good %"].items()},
+            **{f"good %, told {told}": good for told, good in by["good %"].items()},
         })  # fmt: skip
     return pd.DataFrame(shown)
 

@@ -174,9 +174,9 @@ def table(rows: pd.DataFrame) -> pd.DataFrame:
 def _cells(name: Any, some: pd.DataFrame, said: dict[str, str]) -> dict[str, str]:
     shown = {"HD": some.hausdorff_one_sided_mm, "both ways": some.hausdorff_mm,
              "centre": some.center_mm}  # fmt: skip
-    stated = {} if name == "default" else {f"{_NAMES[name]}: the paper's HD": said.get(name, "–")}
+    stated = {} if name == "default" else {f"{_NAMES[name]} in the paper": said.get(name, "–")}
     return stated | {
-        f"{_NAMES[name]}: {title}": f"{cell(mm.median())} ({cell(mm.max())})"
+        f"{_NAMES[name]} {title}": f"{cell(mm.median())} ({cell(mm.max())})"
         for title, mm in shown.items()
     }
 
@@ -190,9 +190,9 @@ def overlap(rows: pd.DataFrame) -> pd.DataFrame:
             scenes = of.drop_duplicates("scene")
             wrong = of[of.kind.notna() & (of.center_mm > _WRONG_MM) & (of.quality == "good")]
             line |= {
-                f"{_NAMES[name]}: mIoU": cell(scenes.miou.median(), 3),
-                f"{_NAMES[name]}: good": f"{(scenes.quality == 'good').sum()} of {len(scenes)}",
-                f"{_NAMES[name]}: good and over 5 mm off": wrong.scene.nunique(),
+                f"{_NAMES[name]} mIoU": cell(scenes.miou.median(), 3),
+                f"{_NAMES[name]} good": f"{(scenes.quality == 'good').sum()} of {len(scenes)}",
+                f"{_NAMES[name]} good and over 5 mm off": wrong.scene.nunique(),
             }
         lines.append(line)
     return pd.DataFrame(lines)
@@ -255,9 +255,9 @@ def strength(rows: pd.DataFrame) -> pd.DataFrame:
             "distance, falloff, times": str(CONFIGURATIONS[int(str(number))]),
             "the paper's mIoU": f"{_SAID_MIOU[int(str(number))]:.2f}",
             "mIoU": cell(scenes.miou.mean(), 3),
-            **{f"{name}: mIoU": cell(miou.mean(), 3)
+            **{f"{name} mIoU": cell(miou.mean(), 3)
                for name, miou in zip(_PRESSED, of, strict=True)},
-            "tumors' HD, mm: median (worst)":
+            "tumors' HD":
                 f"{cell(tumors.hausdorff_one_sided_mm.median())} "
                 f"({cell(tumors.hausdorff_one_sided_mm.max())})",
         })  # fmt: skip
