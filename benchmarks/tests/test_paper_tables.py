@@ -20,7 +20,7 @@ def row(method, scene, part, kind, mm, quality="good", miou=0.8):
     return {
         "method": method, "scene": scene, "part": part, "kind": kind, "quality": quality,
         "miou": miou, "variant": "D3", "hausdorff_mm": mm + 1, "hausdorff_one_sided_mm": mm,
-        "center_mm": mm / 2,
+        "center_mm": mm / 2, "labels_s": 0.02,
     }  # fmt: skip
 
 
@@ -59,6 +59,7 @@ def test_only_good_answers_can_be_good_and_wrong():
     (line,) = paper.overlap(ROWS).to_dict("records")
     assert (line["M_lim good"], line["M_lim good and over 5 mm off"]) == ("2 of 2", 1)
     assert (line["M_full good"], line["M_full good and over 5 mm off"]) == ("1 of 2", 0)
+    assert line["M_lim labels, ms"] == "20"
     assert line["M_lim mIoU"] == "0.800"  # of scenes, not of parts
 
 
