@@ -326,7 +326,7 @@ def _measured(folder: Path, plan: str) -> list[dict[str, Any]]:
                     yield {**about, "frame": frame, **_judged(found, scene, mine)}
 
     # The method's fingerprint is of intact organs.
-    code = scripting.code_sha256(Path(registration.__path__[0]).glob("*.py"))
+    code = scripting.code_sha256([Path(__file__), *Path(registration.__path__[0]).glob("*.py")])
     about = {"scenes": [path.name for path in scenes], "registration": code}
     return scripting.kept(folder / "rows.json", about, follow if plan == "sequence" else measure)
 
