@@ -102,8 +102,8 @@ class Tracker:
                 ``Outline``, ``FreeSpace``, in the frame of ``points``; and what a tracked
                 ultrasound probe recorded (``read_ultrasound``). There may be no points: then it
                 has twelve places or more, touched or outlined.
-            full_view: all that the camera saw, by which the estimate is judged; default:
-            ``points``.
+            full_view: all that the camera saw, by which the estimate is judged; default: what is
+                in ``points``.
             grid: voxels along the longest side of the labelled volume.
             seed: of the random points.
             frame: without points: of the evidence, and of the answer; in another one than a
