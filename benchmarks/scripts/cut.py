@@ -489,8 +489,9 @@ def picture(rows: pd.DataFrame, path: Path) -> None:
         steps = rows[rows.told == told].groupby(rows.share.round(2)).off_mm
         for share, label, style in ((0.5, f"told: {told}, median", "-"), (0.95, "95 %", "--")):
             axes.plot(steps.quantile(share), style, color=colour, marker=".", label=label)
-    axes.set(xlabel="share that is cut", ylabel="error of the tumor's centre, mm", ylim=(0, None))
-    axes.legend(frameon=False, ncols=3)
+    axes.set(xlabel="share that is cut", ylabel="error of the tumor's centre, mm")
+    axes.set_ylim(0, 1.3 * axes.get_ylim()[1])  # room for the legend
+    axes.legend(frameon=False, ncols=3, fontsize="small", loc="upper left")
     drawing.save(figure, path)
 
 
