@@ -78,7 +78,7 @@ def test_commands_and_an_example_run_from_the_wheel(environment, tmp_path):
     (bag := tmp_path / "seen.mcap").touch()
     without = subprocess.run([*command, "inspect", bag], capture_output=True, text=True, env=clean)
     assert without.returncode == 2
-    assert "pip install 'tumortrack-devices'" in without.stderr
+    assert f"pip install 'tumortrack-devices=={version('tumortrack')}'" in without.stderr
     example = ROOT / "examples" / "01_prepare_and_look.py"
     assert "kidney: 1" in run(python, example, tmp_path, env=clean, cwd=tmp_path)
     assert (tmp_path / "case" / "qc.png").stat().st_size > 10_000

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import re
 import tomllib
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+import tumortrack
 
 ROOT = Path(__file__).parents[2]
 
@@ -53,21 +57,27 @@ def test_a_wheel_comes_with_what_it_needs(tool, tmp_path):
     assert not {"ruff", "tumortrack"} & parts.keys()  # developers' own, and itself
 
 
+def projects() -> list[dict[str, Any]]:
+    folders = (".", "devices", "occupancy", "resection", "benchmarks", "experiment")
+    texts = ((ROOT / folder / "pyproject.toml").read_text("utf-8") for folder in folders)
+    return [tomllib.loads(text) for text in texts]
+
+
 def asked_for() -> list[Requirement]:
     lines: list[str] = []
-    for folder in (".", "devices", "occupancy", "resection", "benchmarks", "experiment"):
-        about = tomllib.loads((ROOT / folder / "pyproject.toml").read_text("utf-8"))
+    for about in projects():
         lines += about["project"]["dependencies"]
         for extra in about["project"].get("optional-dependencies", {}).values():
             lines += extra
         lines += about.get("dependency-groups", {}).get("clients", [])
-    return [Requirement(line) for line in lines if not line.startswith("tumortrack")]
+    return [Requirement(line) for line in lines]
 
 
 def test_every_range_is_locked_to_a_version_in_it_by_hash(tool):
     locked = tool.versions()
-    assert len(asked_for()) > 45
-    for requirement in asked_for():
+    others = [asked for asked in asked_for() if not asked.name.startswith("tumortrack")]
+    assert len(others) > 45
+    for requirement in others:
         assert locked[canonicalize_name(requirement.name)][0] in requirement.specifier
     assert all(digests for _, digests in locked.values())
     cpu = tool.pinned((ROOT / "requirements/torch-cpu.txt").read_text("utf-8"))["torch"]
@@ -82,3 +92,16 @@ def test_what_is_installed_is_what_is_locked_and_its_licences_are_listed(tool):
     rows, made = (set(text.splitlines()) for text in (tool.TABLE.read_text("utf-8"), tool.table()))
     assert len(made) > 50
     assert made <= rows, "run make licences"  # some are for one Python or machine alone
+
+
+def test_one_version_is_stated_everywhere_with_the_date_that_the_changelog_gives_it():
+    stated = tumortrack.__version__
+    assert [about["project"]["version"] for about in projects()] == [stated] * 6
+    ours = {str(asked.specifier) for asked in asked_for() if asked.name.startswith("tumortrack")}
+    assert ours == {f"=={stated}", ""}  # none: tumortrack[live] has an extra of its own
+    assert f'"tumortrack[live]=={stated}"' in (ROOT / "docs/package.md").read_text("utf-8")
+    changes = (ROOT / "CHANGELOG.md").read_text("utf-8")
+    newest, date = re.findall(r"^## ([0-9.]+) \((.+)\)$", changes, re.MULTILINE)[0]
+    cited = (ROOT / "CITATION.cff").read_text("utf-8").splitlines()
+    assert newest == stated
+    assert {f"version: {stated}", f"date-released: {date}"} <= set(cited)

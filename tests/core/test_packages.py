@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+import tumortrack
 from tumortrack.core.packages import CHECKOUT, to_install
 
 
@@ -15,5 +16,6 @@ def test_a_checkout_installs_its_own_folders_and_wheels_come_from_a_release(
     package, folder, tmp_path
 ):
     assert to_install(package) == f"pip install -e '{CHECKOUT}{folder}'"
-    assert to_install(package, tmp_path).startswith(f"pip install '{package}' --find-links ")
+    wheel = f"pip install '{package}=={tumortrack.__version__}' --find-links "
+    assert to_install(package, tmp_path).startswith(wheel)
     assert to_install("acme[far]") == "pip install 'acme[far]'"

@@ -29,7 +29,7 @@ LIBRARIES = Path(__file__).parent
 _CODES = {float: "d", int: "q"}
 _AGAIN = (
     "In a checkout `make setup` builds them; elsewhere install the package again: "
-    "`pip install --force-reinstall tumortrack`."
+    "`pip install --force-reinstall` and its wheel."
 )
 _RESULTS = {None: None, float: ctypes.c_double, int: ctypes.c_int64}
 
