@@ -57,7 +57,7 @@ _NAMES = {  # by the module that has them
 }
 _HOMES = {name: home for home, names in _NAMES.items() for name in names.split()}
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 __all__ = sorted(_HOMES)
 
 
