@@ -45,7 +45,7 @@ from tumortrack_benchmarks.judging import rigid_centers_mm
 from tumortrack_benchmarks.physics.evidence import ALL_TRUE, ERRORS, EvidenceSource, hidden
 from tumortrack_benchmarks.physics.scenes import random_scenes
 
-_FIRST = {"kidney": 1000, "prostate": 2000, "liver": 3000}  # numbers of organs
+_FIRST = {"prostate": 2000, "liver": 3000}  # numbers of organs
 _LEAST_MM, _LOST_MM = 0.1, 30.0  # misses: less is noise; more are other minima, which fits refuse
 _KNOTS = (0.02,)  # quantiles of a figure from which it counts; more fit no better what is left out
 _SMOOTH = 0.05  # of the pinball's corner, so that its slope is one
@@ -67,6 +67,7 @@ EVIDENCE: tuple[dict[str, int], ...] = (
     {"free": 3},
 )  # fmt: skip
 ALONE: tuple[dict[str, int], ...] = {"touch": 16}, {"touch": 48}, {"plane": 3}, {"plane": 12}
+_ADVICE = ["kind", "foreseen_mm", "found_mm", "miss_before_mm", "miss_after_mm"]
 _NO_CLOUD = SensorCloud(np.zeros((0, 3), np.float32))
 
 
@@ -78,6 +79,8 @@ class Options:
     """Folder of organs and scenes."""
     kidneys: int = 9
     """So many."""
+    first: int = 1000
+    """Number of the first."""
     others: int = 1
     """Livers, and as many prostates."""
     advice: int = 2
@@ -98,12 +101,9 @@ def main(options: Options) -> None:
     organs = list(_organs(options))
     rows = pd.DataFrame(scripting.together(_rows, [(options.out, "bounds", *o) for o in organs]))
     rows = rows[rows.segmentation_mm <= READERS_MM]
-    organs_out, *others_out = (
-        bounded(rows, part) for part in ("organ", "family", "evidence", "shape")
-    )
-    ways = (organs_out, "family"), (organs_out, "shape"), *zip(
-        others_out, ("family", "evidence", "shape"), strict=True
-    )  # fmt: skip
+    organs_out, kinds = bounded(rows, "organ"), ("family", "evidence", "shape")
+    ways = [(organs_out, "family"), (organs_out, "shape")]
+    ways += [(bounded(rows, kind), kind) for kind in kinds if rows[kind].nunique() > 1]
     tables = [left_out(*way).astype(object).fillna(scripting.NOTHING) for way in ways]
     if options.document is not None:
         draw(organs_out, writer.image("bounds"))
@@ -113,14 +113,16 @@ def main(options: Options) -> None:
     about = {"organs": len(organs)}
     if options.write is not None:
         store.write_json(options.write, to_builtins(learned(rows, about)))
-        first = _FIRST["kidney"] + options.kidneys  # not known to what was just learned
-        about_one = options.out, "advice", "kidney"
-        further = [(*about_one, first + n, options.states) for n in range(options.advice)]
-        found = advice_found(pd.DataFrame(scripting.together(_rows, further)))
-        print(table_of(found))
+    first = options.first + options.kidneys  # not known to what was learned
+    further = [
+        (options.out, "advice", "kidney", first + n, options.states) for n in range(options.advice)
+    ]
+    found = advice_found(pd.DataFrame(scripting.together(_rows, further)))
+    print(table_of(found))
+    written["bounds-advice"] = found
+    if options.write is not None:
         ratios = dict(zip(found.kind, found["found / foreseen"], strict=True))
         store.write_json(options.write, to_builtins(learned(rows, about, ratios)))
-        written["bounds-advice"] = found
     of_all = tables[0].iloc[-1]
     good = round(int(of_all["answers"]) * int(of_all["good %"]) / 100)
     over = share_words(int(of_all["center over 5 mm"]), good)
@@ -130,7 +132,7 @@ def main(options: Options) -> None:
 
 def _organs(options: Options) -> Iterator[tuple[str, int, int]]:
     """Shape, number and states."""
-    for shape, first in _FIRST.items():
+    for shape, first in {"kidney": options.first, **_FIRST}.items():
         kidney = shape == "kidney"
         count = options.kidneys if kidney else options.others
         states = options.states if kidney else options.other_states
@@ -143,7 +145,6 @@ def _rows(out: Path, name: str, shape: str, number: int, states: int) -> list[di
     folder, make = out / str(number), rows_of if name == "bounds" else advice_rows
 
     def measure() -> Iterator[dict[str, Any]]:
-        folder.mkdir(parents=True, exist_ok=True)
         scenes = random_scenes(folder, number, states, shape)
         tracker = scripting.tracker_of(folder / "case")
         for seed, scene in enumerate(scenes):
@@ -260,18 +261,17 @@ def advice_rows(tracker: Tracker, scene: Scene, seed: int) -> Iterator[dict[str,
 def advice_found(rows: pd.DataFrame) -> pd.DataFrame:
     """By kind of evidence, how much the bound fell over what was foreseen where that was more than
     a third of a millimetre, and the misses before and after."""
-    lines = []
-    for kind, some in rows[rows.foreseen_mm > 1 / 3].groupby("kind"):
-        lines.append({
-            "kind": kind,
-            "answers": len(some),
-            "foreseen, mm": round(some.foreseen_mm.mean(), 2),
-            "found": round(some.found_mm.mean(), 2),
-            "found / foreseen": round(some.found_mm.mean() / some.foreseen_mm.mean(), 2),
-            "miss before: median": round(some.miss_before_mm.median(), 2),
-            "and after": round(some.miss_after_mm.median(), 2),
-        })  # fmt: skip
-    return pd.DataFrame(lines)
+    rows = rows.reindex(columns=_ADVICE)  # perhaps there was none
+    kinds = rows[rows.foreseen_mm > 1 / 3].groupby("kind")
+    means, medians = kinds[["foreseen_mm", "found_mm"]].mean(), kinds.median()
+    return pd.DataFrame({
+        "answers": kinds.size(),
+        "foreseen, mm": means.foreseen_mm,
+        "found": means.found_mm,
+        "found / foreseen": means.found_mm / means.foreseen_mm,
+        "miss before: median": medians.miss_before_mm,
+        "and after": medians.miss_after_mm,
+    }).round(2).reset_index()  # fmt: skip
 
 
 def _noisy(scene: Scene, std_mm: float, rng: np.random.Generator) -> Scene:

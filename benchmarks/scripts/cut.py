@@ -23,7 +23,6 @@ from PIL import Image
 from scipy.ndimage import binary_dilation, gaussian_filter
 from scipy.spatial import cKDTree
 
-import tumortrack as tt
 from tumortrack import registration
 from tumortrack.core import colours, store
 from tumortrack.core.cloud import CloudConfig, cloud_from_depth
@@ -37,7 +36,6 @@ from tumortrack.core.types import Anatomy, Mesh
 from tumortrack.io import scene_folder
 from tumortrack.io.case import load_case
 from tumortrack.io.evidence_files import evidence_json, read_evidence
-from tumortrack.io.mesh_files import write_anatomy
 from tumortrack.registration.frame import estimate_of
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.report import drawing
@@ -53,7 +51,7 @@ from tumortrack_benchmarks.physics.families import Deformed
 from tumortrack_benchmarks.physics.kidneys import random_anatomy
 from tumortrack_benchmarks.physics.occluders import rod_mesh
 from tumortrack_benchmarks.physics.organ import Generator, transformed
-from tumortrack_benchmarks.physics.scenes import simplified
+from tumortrack_benchmarks.physics.scenes import random_case, simplified
 from tumortrack_benchmarks.physics.tets import TETS
 from tumortrack_benchmarks.physics.views import render_view
 from tumortrack_benchmarks.scripting import cell
@@ -98,8 +96,6 @@ class Options:
     plan: Literal["many", "sequence"] = "many"
     """Four states in six views each, some cut along planes; or cut and lift grow along the
     planner's, in two views."""
-    only_make: bool = False
-    """Measure nothing."""
     document: Path | None = None
     """A page that shows the tables, which go beside it."""
 
@@ -149,8 +145,6 @@ def main(options: Options) -> None:
         except TumortrackError as error:
             print(f"{number}: {error}", flush=True)
         number += 1
-    if options.only_make:
-        return
     rows = pd.DataFrame([row for folder in folders for row in _measured(folder, options.plan)])
     every = table(rows)
     tables = {f"cut-{options.plan}": every, f"cut-{options.plan}-short": beside(every)}
@@ -188,12 +182,7 @@ def make(folder: Path, number: int, plan: str) -> None:
         off = surface.distance(part.vertices_mm)[0]
         if other != tumor and off.min() < _CLEAR_MM and off.max() > -_CLEAR_MM:
             raise TumortrackError("the cut would meet another tumor.")
-    folder.mkdir(parents=True, exist_ok=True)
-    if not (folder / "case").exists():
-        with TemporaryDirectory() as aside:
-            write_anatomy(Path(aside), anatomy)
-            tt.prepare(aside, folder / "case", up=f"{x:.6f},{y:.6f},{z:.6f}", name="kidney")
-    few = simplified(load_case(folder / "case").anatomy)
+    few = simplified(load_case(random_case(folder, number, up_lps=(x, y, z))).anatomy)
     (to_bench, there, surface), inner = laid(few), scene_folder.draw_targets(few, number)
     incision = crack.Incision.of(there, surface, tumor, folder / TETS)
     about = {"family": "cut", "exophytic": bare > _BARE, "tumor": name,

@@ -1,6 +1,6 @@
 """Measure what evidence beside the cloud brings: touches, outlines, landmarks, a held tumor.
 
-    make evidence ARGS='OUT --kidneys 4 --seed 1'     (about 10 minutes on two cores)
+    make evidence ARGS='OUT --kidneys 4'     (about 10 minutes on two cores)
 
 Makes random kidneys, their models and scenes in OUT, as `make bounds` does, draws evidence of each
 scene from its truth with the errors of tools, calibrations and hands, and locates it with and
@@ -12,12 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-import tyro
 from scipy.spatial import cKDTree
 
 import tumortrack_benchmarks.physics.evidence
@@ -34,7 +34,7 @@ from tumortrack_benchmarks.document import table_of
 from tumortrack_benchmarks.judging import rigid_centers_mm
 from tumortrack_benchmarks.physics.evidence import ALL_TRUE, EvidenceSource, Piece, hidden, mirrored
 from tumortrack_benchmarks.physics.scenes import random_scenes
-from tumortrack_benchmarks.scripting import NOTHING, cell
+from tumortrack_benchmarks.scripting import NOTHING, KidneyOptions, cell
 
 # Of errors, in the document.
 _SHOWN = ["kind", "good %", "median, mm", "95 %", "worst", "rigid fit: median", "its 95 %, mm"]
@@ -53,32 +53,19 @@ Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(KidneyOptions):
     """Measure what evidence brings."""
 
-    out: tyro.conf.Positional[Path]
-    """Folder of kidneys, scenes and rows."""
-    kidneys: int = 4
-    """So many."""
-    first: int | None = None
-    """Number of the first kidney; default: 1000 times the seed."""
     states: int = 24
     """Of each; families take turns."""
-    seed: int = 1
-    """Of everything."""
-    document: Path | None = None
-    """A page that shows the tables, which go beside it."""
 
 
 def main(options: Options) -> None:
     """Make what is missing, then measure."""
-    writer = scripting.begun("evidence", options.document)
-    first = 1000 * options.seed if options.first is None else options.first
-    numbers = range(first, first + options.kidneys)
-    options.out.mkdir(parents=True, exist_ok=True)
+    writer, numbers = scripting.begun("evidence", options.document), options.numbers
     pairs = zip(numbers, [*numbers[1:], *numbers[:1]], strict=True)  # with another one's model
     made = [(options.out, *pair, options.states) for pair in pairs]
-    scripting.together(_made, [(options.out, n, options.states) for n in numbers])
+    scripting.together(_made, [(options.out, n, options.states) for n in options.numbers])
     rows = scripting.together(_measured, made)
     frame = pd.DataFrame(rows)
     own = frame[frame.organ == "own"]
@@ -95,13 +82,12 @@ def main(options: Options) -> None:
     short = tables["evidence-kidneys-errors"]
     short = short.loc[short.kind.isin(_KINDS), _SHOWN]
     scenes = len(own[["kidney", "scene"]].drop_duplicates())
-    sample = f"{len(numbers)} organs, {scenes} scenes"
+    sample = f"{options.kidneys} organs, {scenes} scenes"
     writer.tables({"evidence": short, **tables}, sample=sample)
 
 
 def _made(out: Path, number: int, states: int) -> list[Row]:
     """A kidney's scenes, its case and its model."""
-    (out / str(number)).mkdir(exist_ok=True)
     random_scenes(out / str(number), number, states)
     scripting.tracker_of(out / str(number) / "case")
     return []
@@ -383,24 +369,21 @@ def _errors(name: str, some: pd.DataFrame) -> dict[str, Any]:
 def foresight(rows: pd.DataFrame) -> pd.DataFrame:
     """A line for each three touches that were advised: deviations foreseen, errors found (root mean
     square), both along the axis that was least sure, and the found share of the foreseen gain."""
-    told = rows[rows.then_std_mm.notna()].drop_duplicates(["kidney", "scene", "kind"])
-    lines = []
-    for kind, some in told.groupby("kind", sort=False):
-        ratio = (some.off_before_mm - some.off_after_mm) / (some.std_mm - some.then_std_mm)
-        lines.append({
-            "with": kind,
-            "advised": len(some),
-            "foreseen before, mm": cell(_root_mean_square(some.std_mm), 2),
-            "and after": cell(_root_mean_square(some.then_std_mm), 2),
-            "found before, mm": cell(_root_mean_square(some.off_before_mm), 2),
-            "found after": cell(_root_mean_square(some.off_after_mm), 2),
-            "found before, median": cell(some.off_before_mm.median(), 2),
-            "after, median": cell(some.off_after_mm.median(), 2),
-            "found/foreseen gain: median": cell(ratio.median(), 2),
-            "10 %": cell(ratio.quantile(0.1)),
-            "90 %": cell(ratio.quantile(0.9)),
-        })  # fmt: skip
-    return pd.DataFrame(lines)
+    columns = ["std_mm", "then_std_mm", "off_before_mm", "off_after_mm"]
+    told = rows.reindex(columns=[*dict.fromkeys([*rows, *columns])])  # perhaps nothing was advised
+    told = told[told.then_std_mm.notna()].drop_duplicates(["kidney", "scene", "kind"])
+    gain = (told.off_before_mm - told.off_after_mm) / (told.std_mm - told.then_std_mm)
+    kinds = told.assign(gain=gain).groupby("kind", sort=False)
+    squares = (told[columns] ** 2).groupby(told.kind, sort=False).mean() ** 0.5
+    squares.columns = ["foreseen before, mm", "and after", "found before, mm", "found after"]
+    found = squares.assign(**{
+        "found before, median": kinds.off_before_mm.median(),
+        "after, median": kinds.off_after_mm.median(),
+        "found/foreseen gain: median": kinds.gain.median(),
+    }).map(partial(cell, digits=2))  # fmt: skip
+    found.insert(0, "advised", kinds.size())
+    ends = {f"{100 * q:.0f} %": kinds.gain.quantile(q).map(cell) for q in (0.1, 0.9)}
+    return found.assign(**ends).rename_axis("with").reset_index()
 
 
 def verdicts(rows: pd.DataFrame) -> pd.DataFrame:
@@ -414,10 +397,6 @@ def verdicts(rows: pd.DataFrame) -> pd.DataFrame:
             line[f"good %: {kind}"] = _percent((mine == "good").sum(), len(mine))
         lines.append(line)
     return pd.DataFrame(lines)
-
-
-def _root_mean_square(values: pd.Series) -> float:
-    return float(np.sqrt((values**2).mean()))
 
 
 def _percent(count: float, of: float) -> str:

@@ -1,18 +1,15 @@
 """With which noise, cameras and distances are answers still good, and how far off are tumors?
 
-    make noise ARGS='OUT CASE=SCENES ...'
+    make noise ARGS='OUT --kidneys 4'
 
-CASE: a folder with its model; SCENES: of `tumortrack simulate`, whose true organs are seen again
+Makes random kidneys in OUT, their models and simulated scenes, whose true organs are seen again
 under every condition, with the same seeds. Clouds are the organ's, and not searched for it. Rows
-are kept in OUT, a file for each case and condition; the same command goes on where it was stopped.
-The page's are random kidneys by their number (`world.kidneys.random_anatomy`), prepared, with
-`tumortrack.write_scenes(CASE, SCENES, scenes=16, seed=77, elastic=True)`.
+are kept, a file for each kidney and condition; the same command goes on where it was stopped.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,19 +18,16 @@ from typing import Any
 import msgspec
 import numpy as np
 import pandas as pd
-import tyro
 from jaxtyping import Float
 from matplotlib.lines import Line2D
 
 import tumortrack.simulation
-from tumortrack.cli.console import say
-from tumortrack.core import store
 from tumortrack.core.camera import d405, deproject, with_depth_error
 from tumortrack.core.errors import InputError, NoEstimate
-from tumortrack.core.geometry import rigid, transform_points
+from tumortrack.core.geometry import rigid
 from tumortrack.core.render import render_depth
 from tumortrack.core.types import Anatomy, DepthError, DepthFrame, SensorCloud
-from tumortrack.io.scene_folder import Scene, list_scenes, read_scene
+from tumortrack.io.scene_folder import Scene, read_scene
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.report import drawing
 from tumortrack.report.baselines import best_rigid_pose, rigid_fit
@@ -42,8 +36,10 @@ from tumortrack.simulation.sensors import FIGURES, SensorConfig, depth_error_of,
 from tumortrack.tracking.tracker import Tracker, region_for
 from tumortrack_benchmarks import scripting
 from tumortrack_benchmarks.document import share_words, table_of
+from tumortrack_benchmarks.judging import centers_off_mm
 from tumortrack_benchmarks.physics.organ import transformed
-from tumortrack_benchmarks.scripting import NOTHING, cell
+from tumortrack_benchmarks.physics.scenes import simulated_scenes
+from tumortrack_benchmarks.scripting import NOTHING, KidneyOptions, cell
 
 _WIDE_MM = 5.0
 _CONDITIONS = (
@@ -67,27 +63,22 @@ _UNCALIBRATED = "uncalibrated-"
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(KidneyOptions):
     """Disturb, locate, compare."""
 
-    out: tyro.conf.Positional[Path]
-    """Where rows are kept."""
-    cases: tyro.conf.Positional[tuple[str, ...]]
-    """CASE=SCENES: a case with its model, and a folder of scenes of it."""
     conditions: tuple[str, ...] = _CONDITIONS
     """white:MM, correlated:MM:PX, cloud:MM, outliers:%, fat:%, scale:%, depth:MM, CAMERA,
     uncalibrated-CAMERA, or CAMERA:TIMES its noise, and
     from where: @MM."""
     count: int = 16
-    """Scenes of each case, at most."""
-    document: Path | None = None
-    """A page that shows the table, which goes beside it."""
+    """Scenes of each."""
 
 
 def main(options: Options) -> None:
     """Make missing rows, then table and picture."""
     writer = scripting.begun("noise", options.document)
-    frame = pd.DataFrame(list(_rows(options)), columns=_COLUMNS)
+    work = [(options.out, n, options.count, options.conditions) for n in options.numbers]
+    frame = pd.DataFrame(scripting.together(_rows, work), columns=_COLUMNS)
     shown = table(frame)
     print(table_of(shown))
     good = frame[frame.quality == "good"]
@@ -98,24 +89,19 @@ def main(options: Options) -> None:
         draw(frame, writer.image("noise"))
 
 
-def _rows(options: Options) -> Iterator[dict[str, Any]]:
-    """Of all cases and conditions."""
-    sensors = Path(tumortrack.simulation.__path__[0]) / "sensors.toml"
-    code = scripting.code_sha256([Path(__file__), sensors])
-    for pair in options.cases:
-        case, equals, folder = pair.partition("=")
-        if not equals:
-            raise InputError(f"{pair} is not CASE=SCENES.")
-        paths = list_scenes(Path(folder))[: options.count]
-        tracker, scenes = scripting.tracker_of(Path(case)), [read_scene(path) for path in paths]
-        about = {"code": code, "scenes": [store.sha256_of(path) for path in paths]}
-        about |= {"case": store.sha256_of(Path(case) / store.MANIFEST)}
-        for text in options.conditions:
-            file = options.out / Path(case).name / f"{text.replace(':', '-')}.json"
-            measure = partial(measured, tracker, scenes, Condition.read(text))
-            rows = scripting.kept(file, about | {"condition": text}, measure)
-            say(f"{Path(case).name} {text}: {len(rows)} answers")
-            yield from ({"case": Path(case).name, "condition": text, **row} for row in rows)
+def _rows(out: Path, number: int, count: int, conditions: tuple[str, ...]) -> list[dict[str, Any]]:
+    """Of one kidney, under all conditions."""
+    sensors, folder = Path(tumortrack.simulation.__path__[0]) / "sensors.toml", out / str(number)
+    paths = simulated_scenes(folder, number, count)
+    about = scripting.about_scenes(folder / "case", paths, [Path(__file__), sensors])
+    tracker, scenes = scripting.tracker_of(folder / "case"), [read_scene(path) for path in paths]
+    found = []
+    for text in conditions:
+        file = folder / "noise" / f"{text.replace(':', '-')}.json"
+        measure = partial(measured, tracker, scenes, Condition.read(text))
+        rows = scripting.kept(file, about | {"condition": text}, measure)
+        found += [{"case": str(number), "condition": text, **row} for row in rows]
+    return found
 
 
 def table(frame: pd.DataFrame) -> pd.DataFrame:
@@ -324,17 +310,13 @@ def _row(tracker: Tracker, scene: Scene, condition: Condition, seed: int) -> dic
     seconds, shape = time.perf_counter() - start, model.shape
     pose, _ = best_rigid_pose(shape.anatomy_ct, Scene(cloud, true))
     pose = rigid_fit(shape.distances[0], cloud, pose)
-    centres = {name: mesh.box_mm.mean(0) for name, mesh in zip(true.names, true.parts, strict=True)}
-    off, rigid_off, beyond = [], [], False
-    for name, rest in zip(true.names[1:], shape.anatomy_ct.tumors, strict=True):
-        carried = rest.with_vertices(transform_points(pose, rest.vertices_mm))
-        rigid_off.append(np.linalg.norm(carried.box_mm.mean(0) - centres[name]))
-        off.append(np.linalg.norm(estimate.meshes[name].box_mm.mean(0) - centres[name]))
-        bound = estimate.assessment.bounds.get(name)
-        beyond |= bound is not None and bool(off[-1] > bound.error_bound95_mm)
+    posed = transformed(shape.anatomy_ct, pose)
+    off, rigid_off = (centers_off_mm(parts, true) for parts in (estimate.meshes, posed.closed))
+    bounds = {name: each.error_bound95_mm for name, each in estimate.assessment.bounds.items()}
     return {
         "quality": estimate.quality, "check": estimate.finding.check if estimate.finding else "",
-        "off_mm": float(max(off)), "rigid_mm": float(max(rigid_off)), "beyond": beyond,
+        "off_mm": max(off.values()), "rigid_mm": max(rigid_off.values()),
+        "beyond": any(mm > bounds.get(name, np.inf) for name, mm in off.items()),
         "seconds": seconds,
     }  # fmt: skip
 

@@ -14,7 +14,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
@@ -29,7 +28,6 @@ from tumortrack.core import store
 from tumortrack.core.mesh_query import surface_distance
 from tumortrack.core.types import Anatomy
 from tumortrack.io.case import load_case
-from tumortrack.io.mesh_files import write_anatomy
 from tumortrack.io.scene_folder import read_scene
 from tumortrack.report import drawing
 from tumortrack.report.protocol import evaluate_scene
@@ -38,6 +36,7 @@ from tumortrack.simulation.deform.drag import CONFIGURATIONS
 from tumortrack_benchmarks import scripting
 from tumortrack_benchmarks.document import table_of
 from tumortrack_benchmarks.physics.kidneys import random_anatomy
+from tumortrack_benchmarks.physics.scenes import random_case
 from tumortrack_benchmarks.physics.twin import TURNED, VARIANTS, VIEWS, make_scenes
 from tumortrack_benchmarks.scripting import cell
 from tumortrack_occupancy import presets
@@ -232,15 +231,9 @@ def _weights(models: dict[str, Path]) -> str:
 def _study(folder: Path, steps: int) -> Iterable[dict[str, Any]]:
     """Rows of short trainings, one for each of the paper's configurations, on another kidney."""
     number = _SECOND
-    while len((anatomy := random_anatomy(number)[0]).tumors) != 2:
+    while len(random_anatomy(number)[0].tumors) != 2:
         number += 1
-    folder.mkdir(parents=True, exist_ok=True)
-    if not (folder / "case").exists():
-        with TemporaryDirectory() as aside:
-            write_anatomy(Path(aside), anatomy)
-            up = ",".join(f"{value:.6f}" for value in random_anatomy(number)[1])
-            tt.prepare(aside, folder / "case", up=up, name="kidney")
-    case = load_case(folder / "case")
+    case = load_case(random_case(folder, number))
     wanted = (*_PRESSED, *TURNED)
     with live_line("starting ...") as report:
         scenes = make_scenes(folder / "case", folder / "scenes", wanted, VIEWS[:2], report=report)

@@ -2,9 +2,8 @@
 
     make stress ARGS='CASE OUT --count 320'     (about 4 s a scene)
 
-Writes scene folders into OUT, which `tumortrack evaluate` and `tumortrack margins` read. The same
-command goes on where it was stopped. OUT/world.json states case, seed and configuration,
-OUT/failures.json the states that found no equilibrium and the views in which no organ was found.
+Writes scene folders into OUT (``physics.scenes.stress_scenes``), which `tumortrack evaluate` and
+`tumortrack margins` read. The same command goes on where it was stopped.
 `--plans MODEL` also plans, on what the model locates and on the truth, and cuts the true organs
 (4 s a scene); tables of several organs: the same for each, and the last with `--beside` the others.
 """
@@ -31,10 +30,10 @@ import tumortrack as tt
 import tumortrack_benchmarks.physics.cut
 import tumortrack_resection
 from tumortrack.assessment.bound_factor import NAME
-from tumortrack.cli.console import model_folder, progress_bar, say
+from tumortrack.cli.console import model_folder, say
 from tumortrack.core import store
-from tumortrack.core.config import Config, to_builtins
-from tumortrack.core.errors import InputError, NoEstimate, NoPlan, TumortrackError
+from tumortrack.core.config import Config
+from tumortrack.core.errors import InputError, NoEstimate, NoPlan
 from tumortrack.core.estimate import Estimate
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.mesh_query import surface_samples
@@ -46,17 +45,14 @@ from tumortrack.report.metrics import distance_to_surface
 from tumortrack_benchmarks import scripting
 from tumortrack_benchmarks.document import table_of
 from tumortrack_benchmarks.physics.cut import VOXEL_MM, cut
-from tumortrack_benchmarks.physics.families import FAMILIES
 from tumortrack_benchmarks.physics.organ import transformed
-from tumortrack_benchmarks.physics.scenes import StressConfig, StressScenes
-from tumortrack_benchmarks.physics.tets import TETS
+from tumortrack_benchmarks.physics.scenes import StressConfig, stress_scenes
 from tumortrack_benchmarks.scripting import cell
 from tumortrack_resection.budget import planned_budgets
 from tumortrack_resection.drafts import plan_resection
 from tumortrack_resection.located import of_estimate
 from tumortrack_resection.values import MARGIN_MM, Located, ResectionConfig, ResectionPlan
 
-_ABOUT, _FAILURES = "world.json", "failures.json"
 _EXPOSED_MM, _EXOPHYTIC_SHARE = 0.5, 0.05  # of a tumor's surface, so close to the organ's
 _GRID, _FINE = 160, 256  # voxels along the organ; the truth's labels err by 0.2 mm
 _WHOLE = 0.999  # of a tumor: what is missing is a voxel's rounding
@@ -79,10 +75,6 @@ class Options:
     """States that are tried; families take turns."""
     seed: int = 0
     """Of everything."""
-    families: tuple[str, ...] = tuple(FAMILIES)
-    """Which of them."""
-    segmentation: float = 0.6
-    """Share of scenes whose true organ differs from the case as segmentations err."""
     plans: Path | None = None
     """Plan on the estimates of this model (a case has one), and cut."""
     beside: tuple[Path, ...] = ()
@@ -93,30 +85,11 @@ class Options:
 
 def main(options: Options) -> None:
     """Make missing scenes, then plan and cut."""
-    writer = scripting.begun("world", options.document)
-    config = StressConfig(
-        seed=options.seed,
-        families=tuple(scripting.known(options.families, FAMILIES)),
-        segmentation=options.segmentation,
-    )
-    sha256 = store.sha256_of(options.case / store.MANIFEST)
-    scripting.claim(options.out, _ABOUT, {"case_sha256": sha256, "config": to_builtins(config)})
-    world = StressScenes.opened(options.case, config, options.out / TETS)
-    scenes = {f"{n:05d}-{world.family(n)}": n for n in range(options.count)}
-    failures_path = options.out / _FAILURES
-    failures = store.read_json(failures_path) if failures_path.exists() else {}
-    todo = [n for n in scenes if n not in failures and not (options.out / n).exists()]
-    with progress_bar("scenes", len(todo)) as advance:
-        for name in todo:
-            try:
-                world.scene(scenes[name]).write(options.out / name)
-            except TumortrackError as error:
-                failures[name] = f"{type(error).__name__}: {error}"
-                store.write_json(failures_path, failures)
-                say(f"{name}: {failures[name]}")
-            advance()
+    writer = scripting.begun("stress", options.document)
+    config = StressConfig(seed=options.seed)
+    scenes = stress_scenes(options.case, options.out, config, options.count, say)
     if options.plans is not None:
-        made = [name for name in scenes if (options.out / name).exists()]
+        made = [path.name for path in scenes]
         cuts, refused, sample = _planned(options, options.plans, made)
         print(sample, table_of(cuts), table_of(refused), sep="\n\n")
         writer.tables({"world-plans-cuts": cuts, "world-plans-refused": refused}, sample=sample)

@@ -1,12 +1,10 @@
 """How well the lag and the scales of a tracked probe's images are found, and what that brings.
 
-    make ultrasound ARGS='OUT CASE=SCENES ...'
+    make ultrasound ARGS='OUT --kidneys 2'
 
-CASE: a folder with its model; SCENES: of `tumortrack simulate`, over whose true organs a probe is
-swept: forth and back (three passes), or once without turning the probe. Rows are kept in OUT, a
-file for each case and kind of sweep; the same command goes on where it was stopped.
-The page's are the random kidneys 101 and 102 (`physics.kidneys.random_anatomy`), prepared, with
-`tumortrack.write_scenes(CASE, SCENES, scenes=25, seed=77, elastic=True)`.
+Makes random kidneys in OUT, their models and simulated scenes, over whose true organs a probe is
+swept: forth and back (three passes), or once without turning the probe. Rows are kept, a file for
+each kidney and kind of sweep; the same command goes on where it was stopped.
 """
 
 from __future__ import annotations
@@ -19,18 +17,17 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import tyro
 
-from tumortrack.cli.console import say
-from tumortrack.core import store
-from tumortrack.core.errors import InputError, NoEstimate
+from tumortrack.core.errors import NoEstimate
 from tumortrack.core.ultrasound import ImageErrors
-from tumortrack.io.scene_folder import Scene, list_scenes, read_scene
+from tumortrack.io.scene_folder import Scene, read_scene
 from tumortrack.tracking.tracker import Tracker
 from tumortrack_benchmarks import scripting
 from tumortrack_benchmarks.document import table_of
+from tumortrack_benchmarks.judging import centers_off_mm
+from tumortrack_benchmarks.physics.scenes import simulated_scenes
 from tumortrack_benchmarks.probe import Sweep, record
-from tumortrack_benchmarks.scripting import cell
+from tumortrack_benchmarks.scripting import KidneyOptions, cell
 
 # Unit, factor and goal: 0.5 mm of a probe's way at 10 mm/s, 1 mm of 5 cm.
 _LIMITS = {"lag": ("ms", 1000, 0.05), "depth": ("%", 100, 0.02), "width": ("%", 100, 0.02)}
@@ -41,17 +38,12 @@ _NOTHING_MM = np.zeros((0, 3))
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(KidneyOptions):
     """Sweep, locate, compare."""
 
-    out: tyro.conf.Positional[Path]
-    """Where rows are kept."""
-    cases: tyro.conf.Positional[tuple[str, ...]]
-    """CASE=SCENES: a case with its model, and a folder of scenes of it."""
-    count: int = 50
-    """Scenes of each case, at most."""
-    document: Path | None = None
-    """A page that shows the table, which goes beside it."""
+    kidneys: int = 2
+    count: int = 25
+    """Scenes of each."""
 
 
 def main(options: Options) -> None:
@@ -65,20 +57,15 @@ def main(options: Options) -> None:
 
 
 def _rows(options: Options) -> Iterator[dict[str, Any]]:
-    code = scripting.code_sha256([Path(__file__), Path(record.__code__.co_filename)])
-    for pair in options.cases:
-        case, equals, folder = pair.partition("=")
-        if not equals:
-            raise InputError(f"{pair} is not CASE=SCENES.")
-        paths = list_scenes(Path(folder))[: options.count]
-        about = {"code": code, "scenes": [store.sha256_of(path) for path in paths]}
-        about |= {"case": store.sha256_of(Path(case) / store.MANIFEST)}
+    code = Path(__file__), Path(record.__code__.co_filename)
+    for number in options.numbers:
+        folder = options.out / str(number)
+        paths, case = simulated_scenes(folder, number, options.count), folder / "case"
+        about = scripting.about_scenes(case, paths, code)
         for kind in _KINDS:
-            file = options.out / Path(case).name / f"{kind.split(',')[0].replace(' ', '-')}.json"
-            measure = partial(measured, Path(case), paths, kind)
-            rows = scripting.kept(file, about, measure)
-            say(f"{Path(case).name}, {kind}: {len(rows)} answers")
-            yield from ({"case": Path(case).name, "sweep": kind, **row} for row in rows)
+            file = folder / "ultrasound" / f"{kind.split(',')[0].replace(' ', '-')}.json"
+            rows = scripting.kept(file, about, partial(measured, case, paths, kind))
+            yield from ({"case": str(number), "sweep": kind, **row} for row in rows)
 
 
 def measured(case: Path, paths: list[Path], kind: str) -> list[dict[str, Any]]:
@@ -112,12 +99,9 @@ def answered(
         return row | {"quality": "none"}
     (probe,) = estimate.report.probes
     found = [probe.lag_s, probe.depth, probe.width]
-    tumors = {name: estimate.meshes[name].box_mm.mean(0) for name in estimate.report.tumors}
-    true = dict(zip(scene.reference.names, scene.reference.parts, strict=True))
-    off_mm = max(float(np.linalg.norm(at - true[n].box_mm.mean(0))) for n, at in tumors.items())
     return row | {
         "quality": estimate.quality,
-        "off_mm": off_mm,
+        "off_mm": max(centers_off_mm(estimate.meshes, scene.reference).values()),
         **dict(zip(("lag", "depth", "width"), np.subtract(found, errors).tolist(), strict=True)),
         "undetermined": list(probe.undetermined),
     }

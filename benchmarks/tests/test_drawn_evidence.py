@@ -11,7 +11,8 @@ import pytest
 from evidence import errors, foresight
 
 import stress_objects
-from tumortrack.core.errors import ArtifactError
+from tumortrack.core import store
+from tumortrack.core.errors import ArtifactError, InputError
 from tumortrack.core.geometry import triangles_of
 from tumortrack.core.mesh_query import contains
 from tumortrack.io.scene_folder import Scene
@@ -25,7 +26,7 @@ from tumortrack_benchmarks.physics.evidence import (
     met,
     mirrored,
 )
-from tumortrack_benchmarks.physics.scenes import random_scenes
+from tumortrack_benchmarks.physics.scenes import StressConfig, stress_scenes
 
 EXACT = EvidenceErrors(
     tip_mm=0.0, hand_eye_mm=(0.0, 0.0), hand_eye_degrees=0.0, probe_mm=0.0, click_mm=0.0,
@@ -184,10 +185,15 @@ def test_tables_count_pieces_by_scene_and_misses_by_tumor():
 
 
 def test_scenes_that_were_made_or_tried_are_not_made_again(tmp_path):
-    for name in ("case", "scenes"):
-        (tmp_path / name).mkdir()
-    scene().write(tmp_path / "scenes" / "00002-rest")  # the two before had no equilibrium
-    assert [path.name for path in random_scenes(tmp_path, 1, 3)] == ["00002-rest"]
-    assert random_scenes(tmp_path, 1, 2) == []
-    with pytest.raises(ArtifactError):  # there is no case to make the fourth from
-        random_scenes(tmp_path, 1, 4)
+    (case := tmp_path / "case").mkdir()
+    (case / store.MANIFEST).write_text("{}")
+    config = StressConfig(families=("rest", "plate"))
+    assert stress_scenes(case, tmp_path / "scenes", config, 0) == []
+    scene().write(tmp_path / "scenes" / "00000-rest")
+    store.write_json(tmp_path / "scenes" / "failures.json", {"00001-plate": "no equilibrium"})
+    made = stress_scenes(case, tmp_path / "scenes", config, 2)
+    assert [path.name for path in made] == ["00000-rest"]
+    with pytest.raises(ArtifactError):  # the case is too empty to make the third from
+        stress_scenes(case, tmp_path / "scenes", config, 3)
+    with pytest.raises(InputError):
+        stress_scenes(case, tmp_path / "scenes", StressConfig(seed=1), 2)

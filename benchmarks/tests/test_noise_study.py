@@ -8,14 +8,10 @@ import pandas as pd
 import pytest
 from noise import Condition, disturbed, placed
 
-from stories import looking_down
 from stress_objects import ANATOMY
 from tumortrack.core.camera import d405, deproject
 from tumortrack.core.errors import InputError
 from tumortrack.core.types import DepthFrame, SensorCloud
-from tumortrack.io.case import load_case
-from tumortrack.io.scene_folder import Scene
-from tumortrack_benchmarks.physics.organ import transformed
 
 FLAT = DepthFrame(np.full((480, 848), 300.0, np.float32), d405())
 
@@ -91,24 +87,21 @@ def test_what_is_no_condition_is_refused(text):
         Condition.read(text)
 
 
-def test_each_condition_is_measured_once_and_is_a_line_of_the_table(
-    phantom_case, elastic_model, tmp_path
-):
-    case = load_case(phantom_case)
-    for name, spin in (("0", 30.0), ("1", -60.0)):
-        there = transformed(case.anatomy, looking_down(case, 130.0, spin))
-        cloud = SensorCloud(there.organ.vertices_mm.astype(np.float32))
-        Scene(cloud, there).write(tmp_path / "scenes" / name)
+def test_each_condition_is_measured_once_and_is_a_line_of_the_table(ready_case, tmp_path):
+    (kidney := tmp_path / "rows" / "7").mkdir(parents=True)
+    (kidney / "case").symlink_to(ready_case)  # instead of a random one
     page = tmp_path / "page.md"
     page.write_text("<!-- results:noise -->\n<!-- /results:noise -->\n")
     options = noise.Options(
         tmp_path / "rows",
-        (f"{elastic_model}={tmp_path / 'scenes'}",),
+        kidneys=1,
+        first=7,
         conditions=("white:0", "outliers:20"),
+        count=2,
         document=page,
     )
     noise.main(options)
-    files = sorted(path.name for path in (tmp_path / "rows").rglob("*.json"))
+    files = sorted(path.name for path in (kidney / "noise").iterdir())
     assert files == ["outliers-20.json", "white-0.json"]
     table = pd.read_csv(tmp_path / "data" / "noise.csv", comment="#")
     assert table.scenes.tolist() == [2, 2]
@@ -117,7 +110,7 @@ def test_each_condition_is_measured_once_and_is_a_line_of_the_table(
     assert (table["worst tumor off mm: median"] <= table["95 %"]).all()
     assert (tmp_path / "images" / "noise.png").read_bytes().startswith(b"\x89PNG")
 
-    written = [path.stat().st_mtime_ns for path in (tmp_path / "rows").rglob("*.json")]
+    written = [path.stat().st_mtime_ns for path in (kidney / "noise").iterdir()]
     noise.main(options)
-    assert written == [path.stat().st_mtime_ns for path in (tmp_path / "rows").rglob("*.json")]
+    assert written == [path.stat().st_mtime_ns for path in (kidney / "noise").iterdir()]
     assert pd.read_csv(tmp_path / "data" / "noise.csv", comment="#").equals(table)

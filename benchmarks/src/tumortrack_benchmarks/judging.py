@@ -3,15 +3,19 @@ fit to the same points that starts there (``report.baselines``)."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tumortrack.core.errors import NoEstimate
 from tumortrack.core.geometry import transform_points
+from tumortrack.core.rigid_fit import matched_vertices
 from tumortrack.core.types import Anatomy, Mesh
-from tumortrack.io.scene_folder import Scene, Targets
+from tumortrack.io.scene_folder import Scene, Targets, read_scene
 from tumortrack.organ.rest_shape import distance_of
 from tumortrack.registration.model import RegistrationModel
 from tumortrack.report.baselines import best_rigid_pose, rigid_fit
@@ -68,6 +72,21 @@ def judge(tracker: Tracker, anatomy_ct: Anatomy, scene: Scene) -> dict[str, Any]
     return row
 
 
+def judge_folder(tracker: Tracker, anatomy_ct: Anatomy, path: Path) -> dict[str, Any]:
+    """``judge`` of a folder of a stress scene, whose surfaces have the CT's triangles in any order;
+    and which state and view it is."""
+    scene = read_scene(path)
+    pairs = zip(anatomy_ct.parts, scene.reference.parts, strict=True)
+    ordered = (rest.with_vertices(matched_vertices(rest, part)) for rest, part in pairs)
+    number, family, *_ = path.name.split("-")
+    return {
+        "scene": path.name, "state": int(number), "family": family,
+        **{name: scene.meta[name] for name in ("hidden_share", "visible_share")},
+        "segmentation": scene.meta["segmentation"]["kind"],
+        **judge(tracker, anatomy_ct, replace(scene, reference=anatomy_ct.with_parts(ordered))),
+    }  # fmt: skip
+
+
 def _mean_off(found_mm: np.ndarray, targets: Targets) -> float:
     return float(np.linalg.norm(found_mm - targets.points_mm, axis=1).mean())
 
@@ -88,6 +107,14 @@ def _errors(estimated: Mesh, true: Mesh, prefix: str) -> dict[str, float]:
         "outside_mm": outward_miss(estimated, true),
     }
     return {f"{prefix}{name}": mm for name, mm in errors.items()}
+
+
+def centers_off_mm(meshes: Mapping[str, Mesh], truth: Anatomy) -> dict[str, float]:
+    """By tumor: the distance between the middles of its boxes, mm."""
+    return {
+        name: float(np.linalg.norm(meshes[name].box_mm.mean(0) - true.box_mm.mean(0)))
+        for name, true in zip(truth.names[1:], truth.tumors, strict=True)
+    }
 
 
 def rigid_centers_mm(model: RegistrationModel, scene: Scene) -> dict[str, float]:

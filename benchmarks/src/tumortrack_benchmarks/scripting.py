@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Sequence
+import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from dataclasses import dataclass
+from multiprocessing import get_context, parent_process
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NoReturn, TypeVar
 
 import numpy as np
@@ -29,13 +33,38 @@ Options = TypeVar("Options")
 NOTHING = "–"  # in a table, of what was not measured
 
 
-def begun(target: str, document: Path | None) -> ReportWriter:
+@dataclass(frozen=True)
+class KidneyOptions:
+    """Of what is measured on random kidneys."""
+
+    out: tyro.conf.Positional[Path]
+    """Folder of kidneys, scenes and rows."""
+    kidneys: int = 4
+    """So many."""
+    first: int = 4000  # no other random kidney is so numbered
+    """Number of the first."""
+    document: Path | None = None
+    """A page that shows the tables, which go beside it."""
+
+    @property
+    def numbers(self) -> range:
+        return range(self.first, self.first + self.kidneys)
+
+
+def command_of(target: str, words: Sequence[str]) -> str:
+    """A call of make."""
+    return f"make {target} ARGS='{shlex.join(words)}'" if words else f"make {target}"
+
+
+def begun(
+    target: str, document: Path | None, named: Mapping[str, str] = MappingProxyType({})
+) -> ReportWriter:
     """The writer of a document's tables, before anything is measured; they name the present call of
-    make. Raises InputError: there is no such document."""
+    make. ``named``: instead of words of the call. Raises InputError: there is no such document."""
     if document is not None and not document.is_file():
         raise InputError(f"{document} does not exist; --document names a page that shows tables.")
-    given = f" ARGS='{shlex.join(sys.argv[1:])}'" if sys.argv[1:] else ""
-    return ReportWriter(document, f"make {target}{given}")
+    words = [named.get(word, word) for word in sys.argv[1:]]
+    return ReportWriter(document, command_of(target, words))
 
 
 def kept(
@@ -65,7 +94,7 @@ def together(
     """The rows of all, in order, made by as many processes as there are cores."""
     rows = []
     with (
-        ProcessPoolExecutor(available_cores(), get_context("spawn")) as pool,
+        ProcessPoolExecutor(available_cores(), get_context("spawn"), _end_with_parent) as pool,
         progress_bar("organs", len(arguments)) as advance,
     ):
         for found in pool.map(work, *zip(*arguments, strict=True)):
@@ -74,9 +103,26 @@ def together(
     return rows
 
 
+def _end_with_parent() -> None:
+    """A process of a pool waits for work forever, even once its parent was killed."""
+
+    def wait() -> None:
+        if (parent := parent_process()) is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
 def tracker_of(case: Path) -> Tracker:
     """Of a case's model, or a model's folder."""
     return Tracker(tt.load_model(model_folder(case), "cpu"))
+
+
+def about_scenes(case: Path, scenes: Sequence[Path], code: Iterable[Path]) -> dict[str, Any]:
+    """What rows of a case's scenes depend on, beside the method; ``code``: see ``code_sha256``."""
+    about = {"code": code_sha256(code), "case": store.sha256_of(case / store.MANIFEST)}
+    return {**about, "scenes": [store.sha256_of(path) for path in scenes]}
 
 
 def code_sha256(paths: Iterable[Path]) -> str:

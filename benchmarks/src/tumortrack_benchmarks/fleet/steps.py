@@ -23,7 +23,6 @@ from tumortrack.case import prepare as preparing
 from tumortrack.case.options import PrepareOptions
 from tumortrack.core import store
 from tumortrack.core.errors import InputError, TumortrackError
-from tumortrack.core.rigid_fit import matched_vertices
 from tumortrack.io.case import Case, load_case, save_case
 from tumortrack.io.scene_folder import read_scene
 from tumortrack.organ.tets import lattice
@@ -35,7 +34,7 @@ from tumortrack.tracking.tracker import Tracker
 from tumortrack_benchmarks.fleet import checks
 from tumortrack_benchmarks.fleet.patients import Patient, hashed
 from tumortrack_benchmarks.fleet.run import File, Step, Work
-from tumortrack_benchmarks.judging import judge
+from tumortrack_benchmarks.judging import judge_folder
 from tumortrack_benchmarks.margins import Locating, found_factor, head_of, list_states, open_table
 from tumortrack_benchmarks.physics.scenes import (
     StressConfig,
@@ -134,7 +133,7 @@ def states(inputs: Inputs, options: Given, out: Path) -> None:
     for number in range(options["first"], options["first"] + options["count"]):
         shown = None
         for view in range(options["views"]):
-            name = f"{number:06d}-{world.family(number)}-{view}"
+            name = f"{number:06d}-{config.family(number)}-{view}"
             try:
                 shown = shown or world.shown(number)
                 again = number * 1000 + view
@@ -186,19 +185,8 @@ def evaluate(inputs: Inputs, options: Given, out: Path) -> None:
     for folder in _groups(inputs):
         failures |= store.read_json(folder / "failures.json")
         for path in _scenes(folder):
-            scene = read_scene(path)
-            ordered = [
-                rest.with_vertices(
-                    matched_vertices(rest, part)
-                )  # in the order of the case's vertices
-                for rest, part in zip(anatomy.parts, scene.reference.parts, strict=True)
-            ]
-            scene = replace(scene, reference=anatomy.with_parts(ordered))
-            number, family, view = path.name.split("-")
-            about = {"scene": path.name, "state": int(number), "family": family, "view": int(view)}
-            about |= {name: scene.meta[name] for name in ("hidden_share", "visible_share")}
-            about["segmentation"] = scene.meta["segmentation"]["kind"]
-            rows.append(about | judge(tracker, anatomy, scene))
+            view = {"view": int(path.name.rsplit("-", 1)[1])}
+            rows.append(view | judge_folder(tracker, anatomy, path))
     store.write_json(out / "rows.json", {"rows": rows, "failures": failures})
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,7 +13,7 @@ from jaxtyping import Float64
 
 import tumortrack as tt
 from tumortrack.core import store
-from tumortrack.core.config import Config
+from tumortrack.core.config import Config, to_builtins
 from tumortrack.core.errors import TumortrackError
 from tumortrack.core.geometry import transform_points
 from tumortrack.core.solids import mesh_of, solid_of
@@ -21,12 +22,14 @@ from tumortrack.io.case import Case, load_case
 from tumortrack.io.mesh_files import write_anatomy
 from tumortrack.io.scene_folder import InnerPoints, Scene, Targets, draw_targets, list_scenes
 from tumortrack.organ.tets import TetMesh
+from tumortrack_benchmarks.document import make_folder
 from tumortrack_benchmarks.physics import segmentation
 from tumortrack_benchmarks.physics.families import FAMILIES, Deformed, solve
 from tumortrack_benchmarks.physics.kidneys import SHAPES, random_anatomy
 from tumortrack_benchmarks.physics.organ import Organ, transformed
 from tumortrack_benchmarks.physics.tets import TETS, kept, tetrahedralise
 from tumortrack_benchmarks.physics.views import organ_cloud, render_view
+from tumortrack_benchmarks.scripting import claim
 from tumortrack_experiment.kit.base import laid_down as bench_from_ct
 
 _FINE_MM, _EDGE_MM = 0.1, 7.0  # surfaces are simplified by this, edges halved beyond
@@ -46,6 +49,10 @@ class StressConfig(Config, frozen=True, kw_only=True):
     most_hidden: float = 0.7
     segmentation: float = 0.6
     families: tuple[str, ...] = tuple(FAMILIES)
+
+    def family(self, number: int) -> str:
+        """Families take turns."""
+        return self.families[number % len(self.families)]
 
 
 class Shown(NamedTuple):
@@ -95,10 +102,6 @@ class StressScenes:
         """The world of a case's folder."""
         return cls.from_case(load_case(case), store.sha256_of(case / store.MANIFEST), config, tets)
 
-    def family(self, number: int) -> str:
-        """Families take turns."""
-        return self.config.families[number % len(self.config.families)]
-
     def scene(self, number: int) -> Scene:
         """The same number, the same scene. Raises TumortrackError: its state has no equilibrium, or
         the organ is not found in its image (NoEstimate)."""
@@ -107,7 +110,7 @@ class StressScenes:
     def shown(self, number: int) -> Shown:
         """Raises TumortrackError: the state has no equilibrium."""
         config, rng = self.config, np.random.default_rng([self.config.seed, number, 1])
-        state = solve(self.organ, self.family(number), config.seed * 1_000_003 + number)
+        state = solve(self.organ, config.family(number), config.seed * 1_000_003 + number)
         kind: segmentation.Kind = "none"
         if rng.uniform() < config.segmentation:
             kind = segmentation.KINDS[1 + rng.integers(len(segmentation.KINDS) - 1)]
@@ -116,7 +119,7 @@ class StressScenes:
             part.with_vertices(state.forward(part.vertices_mm)) for part in true.parts
         )
         points = state.forward(transform_points(self.bench_from_ct, self.targets.points_ct))
-        about = {"family": self.family(number), "segmentation": segmented, **state.about}
+        about = {"family": config.family(number), "segmentation": segmented, **state.about}
         return Shown(state, truth, self.targets.at(points), number, about, rng)
 
     def first(self, shown: Shown) -> Scene:
@@ -158,29 +161,59 @@ def simplified(anatomy_ct: Anatomy) -> Anatomy:
     )
 
 
-def random_scenes(folder: Path, number: int, states: int, shape: str = "kidney") -> list[Path]:
-    """Scenes of this random organ's first states, families in turn; what is missing is made:
-    FOLDER/case and FOLDER/scenes. Some have no equilibrium, or no organ in the image. ``shape``: of
-    ``kidneys.SHAPES``."""
-    case, scenes = folder / "case", folder / "scenes"
+def stress_scenes(
+    case: Path,
+    out: Path,
+    config: StressConfig,
+    count: int,
+    report: Callable[[str], None] = lambda text: None,
+) -> list[Path]:
+    """The scenes of a case's first states, families in turn: OUT/00000-rest, ...; those that are
+    missing are made. OUT/world.json states case and configuration, OUT/failures.json the states
+    that have no equilibrium and the views in which no organ is found. Raises InputError: OUT holds
+    other files, or scenes of another case or configuration."""
+    identity = {"case_sha256": store.sha256_of(case / store.MANIFEST)}
+    claim(out, "world.json", {**identity, "config": to_builtins(config)})
+    path, names = out / "failures.json", [f"{n:05d}-{config.family(n)}" for n in range(count)]
+    failures = store.read_json(path) if path.exists() else {}
+    todo = [n for n in names if n not in failures and not (out / n).exists()]
+    world = StressScenes.opened(case, config, out / TETS) if todo else None
+    for name in todo:
+        assert world is not None
+        try:
+            world.scene(names.index(name)).write(out / name)
+        except TumortrackError as error:
+            failures[name] = f"{type(error).__name__}: {error}"
+            store.write_json(path, failures)
+        report(f"{name}: {failures.get(name, 'made')}")
+    return [out / name for name in names if name not in failures]
+
+
+def random_case(
+    folder: Path, number: int, shape: str = "kidney", up_lps: tuple[float, ...] | None = None
+) -> Path:
+    """A random organ, prepared, with its model: FOLDER/case, made if it is not there. ``shape``: of
+    ``kidneys.SHAPES``; ``up_lps``: what faces the camera, instead of a random side."""
+    case = folder / "case"
     if not case.exists():
-        anatomy_ct, up_lps = random_anatomy(number, SHAPES[shape])
+        anatomy_ct, side = random_anatomy(number, SHAPES[shape])
+        make_folder(folder)
         with TemporaryDirectory() as aside:
             write_anatomy(Path(aside), anatomy_ct)
-            up = ",".join(f"{value:.6f}" for value in up_lps)
+            up = ",".join(f"{value:.6f}" for value in up_lps or side)
             tt.prepare(aside, case, up=up, name=shape)
-    scenes.mkdir(exist_ok=True)
-    # What is missing before the last that was made was tried, and failed.
-    tried = max((_state(path) for path in scenes.iterdir() if path.is_dir()), default=-1) + 1
-    if tried < states:
-        world = StressScenes.opened(case, StressConfig(seed=number), scenes / TETS)
-        for n in range(tried, states):
-            try:
-                world.scene(n).write(scenes / f"{n:05d}-{world.family(n)}")
-            except TumortrackError:
-                continue
-    return [path for path in list_scenes(scenes) if _state(path) < states]
+    return case
 
 
-def _state(scene: Path) -> int:
-    return int(scene.name.split("-")[0])
+def random_scenes(folder: Path, number: int, states: int, shape: str = "kidney") -> list[Path]:
+    """``stress_scenes`` of a random organ, in FOLDER/scenes."""
+    case = random_case(folder, number, shape)
+    return stress_scenes(case, folder / "scenes", StressConfig(seed=number), states)
+
+
+def simulated_scenes(folder: Path, number: int, count: int) -> list[Path]:
+    """Scenes of a random kidney as ``tumortrack simulate --elastic`` makes them, in
+    FOLDER/simulated."""
+    case, out = random_case(folder, number), folder / "simulated"
+    tt.write_scenes(case, out, scenes=count, seed=77, elastic=True)
+    return list_scenes(out)[:count]
