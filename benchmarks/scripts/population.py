@@ -1,14 +1,14 @@
 """Every KiTS19 kidney with a tumor: the list for a fleet, and the tables of what came of it.
 
-    make population ARGS='DATA --list population.csv'
-    tumortrack fleet population.csv runs/population
-    make population ARGS='DATA --fleet runs/population'
+    make population ARGS='DATA OUT --document docs/results.md'
 
-DATA is a folder with your copies, kits19/case_NNNNN/segmentation.nii.gz. The rule: of the 210 cases
-with a label map all but those set aside for judging (00091, 00093, 00096, 00146, 00155) and those
-used in development (00000, 00002, 00003), in order of their numbers; of each the kidney that
-`tumortrack prepare` takes, the one with most tumor. None is left out by hand or for its result:
-what fails `prepare` or the fleet's quality check is listed as failed, with the reason.
+It makes the list of a `tumortrack fleet` in OUT, and runs that on this machine; the same command
+goes on where it was stopped. DATA is a folder with your copies,
+kits19/case_NNNNN/segmentation.nii.gz. The rule: of the 210 cases with a label map all but those set
+aside for judging (00091, 00093, 00096, 00146, 00155) and those used in development (00000, 00002,
+00003), in order of their numbers; of each the kidney that `tumortrack prepare` takes, the one with
+most tumor. None is left out by hand or for its result: what fails `prepare` or the fleet's quality
+check is listed as failed, with the reason.
 """
 
 from __future__ import annotations
@@ -22,12 +22,19 @@ import numpy as np
 import pandas as pd
 import tyro
 
-from tumortrack.cli.console import say
 from tumortrack.core.errors import InputError
 from tumortrack.core.store import write_atomically
 from tumortrack.report import drawing
 from tumortrack_benchmarks import scripting
-from tumortrack_benchmarks.document import ReportWriter, beside_rigid, share_words, spread_mm
+from tumortrack_benchmarks.cli.fleet import Fleet
+from tumortrack_benchmarks.document import (
+    ReportWriter,
+    beside_rigid,
+    make_folder,
+    share_words,
+    spread_mm,
+    spread_words,
+)
 from tumortrack_benchmarks.fleet.results import LOOK, PATIENTS, SCENES
 
 SET_ASIDE, DEVELOPMENT = (91, 93, 96, 146, 155), (0, 2, 3)
@@ -57,34 +64,29 @@ _SHOWN = {
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """Make the list of a population, or the tables of a finished run over it."""
+    """Run a fleet over a population, and make its tables."""
 
     data: Annotated[Path, tyro.conf.Positional]
     """Folder of your own copies of the data."""
-    list: Path | None = None
-    """Write the list for `tumortrack fleet` here."""
+    out: Annotated[Path, tyro.conf.Positional]
+    """Folder of the fleet and of its list."""
     count: int | None = None
     """Only the first so many."""
-    fleet: Path | None = None
-    """Folder that `tumortrack fleet` wrote."""
-    document: Path = Path("docs/results.md")
+    document: Path | None = None
     """A page that shows the tables, which go beside it with the plots."""
 
 
 def main(options: Options) -> None:
-    """The list, the tables, or both."""
-    if options.list is None and options.fleet is None:
-        raise InputError("give --list FILE to make the list, or --fleet OUT for the tables of it.")
-    if options.list is not None:
-        maps = label_maps(options.data)[: options.count]
-        lines = [f"{path.parent.name},{path.absolute()},1" for path in maps]
-        head = "name,input,margin_states"  # one state: the least
-        write_atomically(options.list, "\n".join([head, *lines, ""]).encode())
-        say(f"{len(lines)} kidneys listed in {options.list}.")
-    if options.fleet is not None:
-        writer = scripting.begun("population", options.document)
-        fill(options.fleet, writer)
-        say(f"written to {options.document}.")
+    """The list, the fleet, the tables."""
+    writer = scripting.begun("population", options.document, {str(options.data): "DATA"})
+    listed, maps = options.out / "population.csv", label_maps(options.data)[: options.count]
+    lines = [f"{path.parent.name},{path.absolute()},1" for path in maps]
+    head = "name,input,margin_states"  # one state: the least
+    make_folder(options.out)
+    write_atomically(listed, "\n".join([head, *lines, ""]).encode())
+    Fleet(list=listed, out=options.out).run()
+    if options.document is not None:
+        fill(options.out, writer)
 
 
 def label_maps(data: Path) -> list[Path]:
@@ -107,31 +109,36 @@ def fill(fleet: Path, writer: ReportWriter) -> None:
     if done.empty:
         raise InputError(f"{fleet} has no patient that is done.")
     scenes = scenes.merge(people[["patient", "slice_mm"]], on="patient")
-    scenes = scenes.reindex(columns=[*dict.fromkeys([*scenes, *ERRORS.values(), "radius_mm"])])
     draw(scenes, writer.image(BLOCK))
     rows, alone = grouped(scenes), len(done[~done.patient.isin(views.patient)])
     sample = (
         f"{len(people)} patients, {len(done)} done, {alone} with nothing for a person to look at, "
         f"{int(done.scenes.sum())} scenes, {int(done.lost.sum())} more could not be made"
     )
-    short = rows[rows.by.isin(["all", "state"])]
-    more = {"over 5 mm": "over 5 mm", "of good": "good within radius %"}
-    more["rank correlation"] = "rank correlation"
-    shown = short[["value", "scenes", "good %"]].assign(**beside_rigid(short))
-    short = shown.join(short[[*more]].rename(columns=more))
-    good = scenes[scenes.verdict == "good"]
-    share = share_words(int(good.over_5_mm.sum()), len(good)) if len(good) else "none"
+    short = shown(rows[rows.by.isin(["all", "state"])])
     tables = {"": short, "-groups": rows, "-wrong": wrong(scenes), "-look": views}
     tables = {f"{BLOCK}{name}": table for name, table in tables.items()}
-    writer.tables(tables, sample=sample, interval=f"over 5 mm {share} of good")
+    interval = f"over 5 mm {rows['over 5 mm, % of good'].iloc[0]} of good"
+    writer.tables(tables, sample=sample, interval=interval)
 
 
-def grouped(scenes: pd.DataFrame) -> pd.DataFrame:
-    """Verdicts and errors by load and by tumor; a scene counts once for each tumor."""
+def shown(rows: pd.DataFrame) -> pd.DataFrame:
+    """The columns of ``grouped`` for a page."""
+    more = {"over 5 mm": "over 5 mm", "of good": "good within radius %"}
+    more |= {name: name for name in ("rank correlation", "over 5 mm, % of good")}
+    short = rows[["value", "scenes", "good %"]].assign(**beside_rigid(rows))
+    short = short.join(rows[[*more]].rename(columns=more))
+    return short.assign(**{"also poor answers": spread_words(rows, "any centre")})
+
+
+def grouped(scenes: pd.DataFrame, **more: pd.Series) -> pd.DataFrame:
+    """Verdicts and errors by load and by tumor, and by what ``more`` says of scenes; a scene counts
+    once for each tumor. Errors are those of good answers."""
+    scenes = scenes.reindex(columns=[*dict.fromkeys([*scenes, *ERRORS.values(), "radius_mm"])])
     limits = [-np.inf, *_HIDDEN.values()]
     bands = pd.cut(scenes.hidden_share, limits, labels=[*_HIDDEN])
     given = {"all": pd.Series("all", scenes.index), "state": scenes.family}
-    given |= {"hidden": bands, "kind": scenes.kind, "at": scenes.position}
+    given |= more | {"hidden": bands, "kind": scenes.kind, "at": scenes.position}
     for column, (words, limits) in _AGAINST.items():
         given[words] = pd.cut(scenes[column], limits, right=False)
     rows = []
@@ -144,7 +151,10 @@ def grouped(scenes: pd.DataFrame) -> pd.DataFrame:
                 row[f"{verdict} %"] = f"{100 * (mine.verdict == verdict).mean():.0f}"
             for words, column in ERRORS.items():
                 row |= spread_mm(words, good[column])
+            row |= spread_mm("any centre", mine.middle_mm)
             row |= {f"over {mm} mm": int(good[f"over_{mm}_mm"].sum()) for mm in (3, 5)}
+            far = int(good.over_5_mm.sum()), len(good)
+            row["over 5 mm, % of good"] = share_words(*far) if len(good) else scripting.NOTHING
             said = mine.dropna(subset=["radius_mm"])
             row |= {
                 "within radius %": f"{100 * (said.middle_mm <= said.radius_mm).mean():.0f}",
