@@ -24,7 +24,7 @@ COMPILER = $(BIN)/python tools/build_backend.py --compiler >/dev/null 2>&1 || { 
 NO_COMPILER = $(BIN)/pip uninstall --quiet --yes ziglang 2>/dev/null
 
 .DEFAULT_GOAL := help
-.PHONY: help setup debian clients demo demo-scenes test quick pythons pytest test-hard check attack replay fingerprint figures bench soak wheel lock licences audit stress pull bounds evidence cut paper ultrasound noise rehearsal population site pictures clean
+.PHONY: help setup debian clients demo demo-scenes test quick pythons pytest test-hard check attack replay fingerprint figures pages bench soak wheel lock licences audit stress pull bounds accuracy following evidence cut paper ultrasound noise rehearsal population site pictures clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
@@ -113,7 +113,10 @@ replay: setup  ## has any of 500 answers changed since runs/replay.json, by how 
 fingerprint: setup  ## the method's version, by 30 answers: recorded again where it has changed (a minute)
 	$(BIN)/python tools/replay.py fingerprint
 
-figures: setup  ## write the measured figures of the pages from docs/data; fails on tables of another method
+figures: setup  ## measure all that the pages claim with today's method, then `make pages` (an hour; ARGS="STEP ...", ARGS="--data DATA": also your KiTS19)
+	$(BIN)/python benchmarks/scripts/figures.py $(ARGS)
+
+pages: setup  ## write the measured figures of the pages from docs/data; fails on tables of another method
 	$(BIN)/python tools/figures.py
 
 test-hard: setup  ## tests on narrow vector units beside two busy processes (ARGS=tests/...)
@@ -139,6 +142,12 @@ pull: setup  ## an organ under the pull of a plan's holder, for the virtual sour
 bounds: setup  ## learns how far off organs and tumors may be, from random organs (ARGS="OUT --write src/tumortrack/assessment/bounds.json"; an hour)
 	$(BIN)/python benchmarks/scripts/bounds.py $(ARGS)
 
+accuracy: setup  ## how far off tumors are by state and organ, on random kidneys (ARGS="OUT --kidneys 12")
+	$(BIN)/python benchmarks/scripts/accuracy.py $(ARGS)
+
+following: setup  ## how well moving random kidneys are followed: jumps, two cameras (ARGS="OUT --kidneys 4")
+	$(BIN)/python benchmarks/scripts/following.py $(ARGS)
+
 evidence: setup  ## what touches, outlines, landmarks and held tumors bring, on random kidneys (ARGS="OUT --kidneys 4"; 10 minutes)
 	$(BIN)/python benchmarks/scripts/evidence.py $(ARGS)
 
@@ -148,13 +157,13 @@ cut: setup  ## how well a tumor is followed while it is cut out of random kidney
 paper: setup  ## the paper's table and its study of deformations, on the twin (ARGS="CASE OUT --limited MODEL --full MODEL")
 	$(BIN)/python benchmarks/scripts/paper.py $(ARGS)
 
-population: setup  ## KiTS19's kidneys with tumors: their list for a fleet, and what came of it (ARGS="DATA --list FILE", then --fleet OUT)
+population: setup  ## KiTS19's kidneys with tumors: a fleet over them, and its tables (ARGS="DATA OUT --count 12")
 	$(BIN)/python benchmarks/scripts/population.py $(ARGS)
 
-ultrasound: setup  ## how well lag and scales of a tracked probe are found (ARGS="OUT CASE=SCENES ..."; 5 s an answer)
+ultrasound: setup  ## how well lag and scales of a tracked probe are found, on random kidneys (ARGS="OUT --kidneys 2"; 5 s an answer)
 	$(BIN)/python benchmarks/scripts/ultrasound.py $(ARGS)
 
-noise: setup  ## good answers and tumors' errors against noise, cameras and distances (ARGS="OUT CASE=SCENES ..."; a second an answer)
+noise: setup  ## good answers and tumors' errors against noise, cameras and distances, on random kidneys (ARGS="OUT --kidneys 4"; half a second an answer)
 	$(BIN)/python benchmarks/scripts/noise.py $(ARGS)
 
 rehearsal: setup  ## the experiment on a bench that does not exist, by all its commands (ARGS="CASE MODEL OUT", after make demo)

@@ -41,6 +41,7 @@ MODELS = {"elastic_model", "quick_model", "learnt_model", "slim_model"}
 # The longest files first: with few workers none is left alone with one at the end. Two of the
 # first three make no `elastic` model: else each worker would compile its kernels for itself.
 SLOWEST = (
+    "test_all_figures.py",
     "test_soak.py",
     "test_locate.py",
     "test_demo.py",

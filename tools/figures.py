@@ -77,7 +77,7 @@ def differs(table: Path, check: bool) -> list[str]:
     if not check:
         store.write_atomically(table, sensors().encode())
     same = table.is_file() and table.read_text(encoding="utf-8") == sensors()
-    return [] if same else [f"{table.name} differs from sensors.toml: make figures"]
+    return [] if same else [f"{table.name} differs from sensors.toml: make pages"]
 
 
 def faults(root: Path, check: bool) -> list[str]:
@@ -92,7 +92,7 @@ def faults(root: Path, check: bool) -> list[str]:
             found.append(f"{name}: {error}")
             continue
         if new != text and check:
-            found.append(f"{name} differs from its tables: make figures")
+            found.append(f"{name} differs from its tables: make pages")
         elif new != text:
             page.write_text(new, encoding="utf-8")
             print(f"{name} written")

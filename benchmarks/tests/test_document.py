@@ -27,7 +27,10 @@ from tumortrack_benchmarks.document import (
 )
 
 ROOT = Path(__file__).parents[2]
-NAMES = "bounds", "demo", "evidence", "noise", "population", "pull", "rehearsal", "soak", "stress"
+NAMES = (
+    *("accuracy", "bounds", "demo", "evidence", "figures", "following", "noise", "population"),
+    *("pull", "rehearsal", "soak", "stress", "ultrasound"),
+)
 
 
 def test_rows_are_measured_once_for_all_that_decides_them(tmp_path):
