@@ -37,7 +37,7 @@ from tumortrack_devices.player import ScenePlayer, ScenePlayerConfig
 
 _HZ = 30.0
 _ASIDE_MM, _TURN_DEGREES = 25.0, 40.0  # of a jump, over the table
-_EVERY_S = 2.0  # jumps: twice as long as between searches as in a first frame
+_EVERY_S = 2.3  # jumps, at all times between searches as in a first frame, which are each second
 _SECOND_DEGREES = 45.0  # of the second camera's view, aside
 _JUMPING = "room_from_organ", "room_from_rod"
 KINDS = "one camera", "two cameras", "jumps"
