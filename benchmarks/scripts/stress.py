@@ -92,7 +92,7 @@ def main(options: Options) -> None:
         made = [path.name for path in scenes]
         cuts, refused, sample = _planned(options, options.plans, made)
         print(sample, table_of(cuts), table_of(refused), sep="\n\n")
-        writer.tables({"world-plans-cuts": cuts, "world-plans-refused": refused}, sample=sample)
+        writer.tables({"stress-plans": cuts, "stress-refused": refused}, sample=sample)
 
 
 def _planned(
