@@ -12,6 +12,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal, NamedTuple
@@ -96,6 +97,10 @@ class Options:
     plan: Literal["many", "sequence"] = "many"
     """Four states in six views each, some cut along planes; or cut and lift grow along the
     planner's, in two views."""
+    states: int = 7
+    """Of each organ, the first so many."""
+    looks: int = 6
+    """Of each state, likewise."""
     document: Path | None = None
     """A page that shows the tables, which go beside it."""
 
@@ -140,7 +145,7 @@ def main(options: Options) -> None:
     folders, number = list[Path](), 1000 * options.seed
     while len(folders) < options.organs:
         try:
-            make(options.out / str(number), number, options.plan)
+            make(options.out / str(number), number, options)
             folders.append(options.out / str(number))
         except TumortrackError as error:
             print(f"{number}: {error}", flush=True)
@@ -156,7 +161,7 @@ def main(options: Options) -> None:
         film(folders[0], path.with_name("cut.gif"))
 
 
-def make(folder: Path, number: int, plan: str) -> None:
+def make(folder: Path, number: int, options: Options) -> None:
     """An organ's case, model and scenes, as far as they are missing. Raises TumortrackError: it has
     no tumor that can be cut out."""
     rng, (anatomy, _) = np.random.default_rng([number, 0xC5]), random_anatomy(number)
@@ -164,7 +169,7 @@ def make(folder: Path, number: int, plan: str) -> None:
     lean, out = np.deg2rad(rng.uniform(0, _LEAN_DEGREES)), crack.way_out(anatomy, tumor)
     x, y, z = turned_by(lean * unit(np.cross(out, rng.normal(size=3)))) @ out
     turn, deep, planes = rng.uniform(0, 2 * np.pi), rng.uniform(0, 70.0), int(rng.integers(-8, 7))
-    planes, name = 6 if plan == "sequence" else planes, anatomy.names[1 + tumor]
+    planes, name = 6 if options.plan == "sequence" else planes, anatomy.names[1 + tumor]
 
     def laid(anatomy_ct: Anatomy) -> tuple[np.ndarray, Anatomy, crack.CutSurface]:
         to_bench = bench_from_ct(anatomy_ct.organ, (x, y, z))
@@ -187,8 +192,9 @@ def make(folder: Path, number: int, plan: str) -> None:
     incision = crack.Incision.of(there, surface, tumor, folder / TETS)
     about = {"family": "cut", "exophytic": bare > _BARE, "tumor": name,
              "surface": f"{planes} planes" if planes > 0 else "shell"}  # fmt: skip
-    for state_name, (share, lift) in asked(plan, rng).items():
-        looks = {folder / f"{state_name}-{seen_as}": look for seen_as, look in LOOKS[plan].items()}
+    seen_as = dict(islice(LOOKS[options.plan].items(), options.looks))
+    for state_name, (share, lift) in islice(asked(options.plan, rng).items(), options.states):
+        looks = {folder / f"{state_name}-{view}": look for view, look in seen_as.items()}
         missing = {path: look for path, look in looks.items() if not path.exists()}
         try:
             state = crack.solve(incision, share, lift, number) if missing else None

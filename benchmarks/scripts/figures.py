@@ -52,13 +52,13 @@ class Step(NamedTuple):
     calls: tuple[str, ...] = ("{out} {sizes} --document {page}",)
 
 
-_TINY = "--kidneys 2"
+_TINY, _CUT = "--kidneys 2", "--organs 1 --looks 1"
 STEPS = {
     # Those that the bounds in the package were learned from: `make bounds` with --write, in the
     # same folder, leaves the rows. 95 % of a family's 400 parts lie within: 93 to 97.
     "bounds": Step(
         "docs/trust.md", "--kidneys 9 --others 1 --advice 2 --states 40 --other-states 24",
-        f"--kidneys 2 --others 0 --advice 1 --states 4 --first {FIRST}",
+        f"--kidneys 2 --others 0 --advice 1 --states 2 --first {FIRST}",
     ),
     # 750 tumors in scenes, some 200 of them in good answers: if none of these is over 5 mm off, the
     # share is under 2 % (95 %).
@@ -67,9 +67,9 @@ STEPS = {
     "evidence": Step("docs/evidence.md", "--kidneys 4 --states 16", f"{_TINY} --states 1"),
     # 48 images a condition: shares to 12 points, as the table's intervals say. The page names
     # conditions, so that a miniature needs all.
-    "noise": Step("docs/index.md", "--kidneys 4 --count 12", f"{_TINY} --count 1"),
+    "noise": Step("docs/index.md", "--kidneys 4 --count 12", "--kidneys 1 --count 1"),
     # 30 answers a row: what is so in all of them is so in 89 % (95 %).
-    "ultrasound": Step("docs/evidence.md", "--kidneys 2 --count 15", f"{_TINY} --count 1"),
+    "ultrasound": Step("docs/evidence.md", "--kidneys 2 --count 15", "--kidneys 1 --count 1"),
     # 20 jumps: if each is caught up with, 84 % are (95 %). 1,440 frames of each kind.
     "following": Step("docs/results.md", "--kidneys 4 --seconds 12", f"{_TINY} --seconds 2.5"),
     # 60 scenes, some 20 with a good answer: what is so in all of these is so in 84 % (95 %).
@@ -80,11 +80,12 @@ STEPS = {
     ),
     # 160 scenes, 40 a state: medians, and shares to 15 points.
     "cut": Step(
-        "docs/results.md", "--organs 7", "--organs 1", ("{out}/cut {sizes} --document {page}",)
+        "docs/results.md", "--organs 7", f"{_CUT} --states 2",
+        ("{out}/cut {sizes} --document {page}",),
     ),
     # 250 frames after each kind of telling: medians.
     "cut-sequence": Step(
-        "docs/results.md", "--organs 3", "--organs 1",
+        "docs/results.md", "--organs 3", f"{_CUT} --states 3",
         ("{out}/cut-sequence {sizes} --plan sequence --document {page}",),
     ),
     # Medians of 3 to 25 turns, with their spread. Not beside other work.
