@@ -71,7 +71,7 @@ STEPS = {
     # 30 answers a row: what is so in all of them is so in 89 % (95 %).
     "ultrasound": Step("docs/evidence.md", "--kidneys 2 --count 15", "--kidneys 1 --count 1"),
     # 20 jumps: if each is caught up with, 84 % are (95 %). 1,440 frames of each kind.
-    "following": Step("docs/results.md", "--kidneys 4 --seconds 12", f"{_TINY} --seconds 2.5"),
+    "following": Step("docs/results.md", "--kidneys 4 --seconds 12", "--kidneys 1 --seconds 2.5"),
     # 60 scenes, some 20 with a good answer: what is so in all of these is so in 84 % (95 %).
     "stress": Step(
         "docs/results.md", "--count 32", "--count 2",
