@@ -273,7 +273,7 @@ def strength(rows: pd.DataFrame) -> pd.DataFrame:
 
 def draw_curves(curves: dict[str, pd.DataFrame], path: Path) -> None:
     """Validation loss and mIoU over steps."""
-    figure = drawing.new_figure(8.0, 3.4, left=0.08, right=0.98, top=0.95, bottom=0.16, wspace=0.25)
+    figure = drawing.new_figure(8.0, 3.4, left=0.1, right=0.98, top=0.95, bottom=0.16, wspace=0.25)
     for place, column in enumerate(("validation loss", "validation mIoU"), start=1):
         axes = figure.add_subplot(1, 2, place)
         for name, some in curves.items():
@@ -292,11 +292,12 @@ def draw_strength(rows: pd.DataFrame, path: Path) -> None:
         of = scenes[scenes.variant == state].groupby("configuration").miou
         axes.errorbar(
             numbers + shift, of.mean(), yerr=[of.mean() - of.min(), of.max() - of.mean()],
-            fmt="o", ms=4, label=f"{state}: mean, lowest, highest",
+            fmt="o", ms=4, label=f"{state}: mean and range",
         )  # fmt: skip
     axes.plot(numbers, list(_SAID_MIOU.values()), "k_", ms=18, label="the paper, on its gel")
     axes.set(xlabel="configuration", ylabel="mIoU")
-    axes.legend(frameon=False, ncols=2)
+    axes.set_ylim(top=axes.get_ylim()[1] + 0.06)  # room for the legend
+    axes.legend(frameon=False, ncols=2, fontsize="small", loc="upper center")
     drawing.save(figure, path)
 
 
