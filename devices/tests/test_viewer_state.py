@@ -130,15 +130,25 @@ def _number_of(
     """How the panel's box with the frame's number looks, and where it is."""
     seen: list[tuple[tuple[float, ...], np.ndarray]] = []
 
+    ended = threading.Event()
+
+    def feed() -> None:  # else, on a slow machine, the page tells of silence before it is seen
+        while not ended.wait(0.1):
+            sink.publish(state)  # type: ignore[attr-defined]
+
     def shown() -> bool:
-        sink.publish(state)  # type: ignore[attr-defined]
         number = f"no. {state.sequence}"
         before = number in browser.text()
         seen.append((browser.box("#tumortrack-flag .tumortrack-box"), browser.picture()))
-        # On a slow machine the page may tell of silence a moment later.
         return before and number in browser.text() and _parts(seen[-1][1]) == parts
 
-    until(shown, f"state {state.sequence}")
+    thread = threading.Thread(target=feed, daemon=True)
+    thread.start()
+    try:
+        until(shown, f"state {state.sequence}")
+    finally:
+        ended.set()
+        thread.join()
     left, top, width, height = map(round, seen[-1][0])
     place = slice(top, top + height), slice(left, left + width)
     return place, seen[-1][1][place]

@@ -414,8 +414,8 @@ class Cause(StrEnum):
 @dataclass(frozen=True)
 class Likely:
     """A likely cause. ``number``: the factor of UNIT and SCALE, the share of BACKGROUND and HIDDEN,
-    of EVIDENCE the piece, from 1, of NOISE its standard deviation, mm. ``fit``: cost of the fit
-    without it over the model's usual cost; None: not tried."""
+    of EVIDENCE the piece, from 1 (None: all of it), of NOISE its standard deviation, mm. ``fit``:
+    cost of the fit without it over the model's usual cost; None: not tried."""
 
     cause: Cause
     number: float | None = None

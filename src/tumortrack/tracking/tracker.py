@@ -22,7 +22,7 @@ from tumortrack.core.estimate import Estimate, FollowOptions
 from tumortrack.core.evidence import CAMERA, FEWEST_TOUCHES, Cut, Evidence, touched
 from tumortrack.core.geometry import IDENTITY, Affine, rigid, transform_points
 from tumortrack.core.process import tune_malloc
-from tumortrack.core.report import ProbeReport
+from tumortrack.core.report import Cause, Likely, ProbeReport
 from tumortrack.core.types import Anatomy, DepthFrame, SensorCloud, View
 from tumortrack.core.ultrasound import ProbeRecording
 from tumortrack.io.case import Case
@@ -250,6 +250,7 @@ class Tracker:
             advice = f"{words(causes, '')}."
             if touched:
                 advice += " Or its evidence is of another place: try without it."
+                causes = (*causes, Likely(Cause.EVIDENCE))
             raise NotThisOrgan(error.finding or str(error), causes, advice) from error
 
     def warm(self) -> None:
