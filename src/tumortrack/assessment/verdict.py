@@ -60,8 +60,8 @@ _MIN_PROBABILITY = 0.6  # mean over a tumor's points
 _FEW, _MANY, _FOR_EACH = 3, 8, 5
 _MAX_UNSEEN = 0.1  # share of the organ's image without points of a cloud
 # Of a flap's near side: where it was taken for the organ's surroundings, points showed 13 and
-# 15 % of where it would have been, else half or more. Tools hold it so near to its tumor.
-_LEAST_OF_FLAP, _ON_FLAP_MM = 0.35, 10.0
+# 15 % of where it would have been, else a third or more. Tools hold it so near to its tumor.
+_LEAST_OF_FLAP, _ON_FLAP_MM = 0.25, 10.0
 _OUTVOTED = 3  # later pieces at that place that agree with the answer, and so with each other
 _THERE_MM = 15.0  # from what the answer has there: how far apart touches of one spot may lie
 Advise = Literal["all", "touches", "nothing"]
