@@ -24,7 +24,7 @@ from PIL import Image
 from scipy.ndimage import binary_dilation, gaussian_filter
 from scipy.spatial import cKDTree
 
-from tumortrack import registration
+from tumortrack import assessment, registration, tracking
 from tumortrack.core import colours, store
 from tumortrack.core.cloud import CloudConfig, cloud_from_depth
 from tumortrack.core.errors import NoEstimate, TumortrackError
@@ -81,6 +81,7 @@ _ASIDE_MM = 4.0  # of all places of a cut, any way, as a hand-eye calibration er
 _FRAMES_S = (0.0, 0.7, 0.9, 1.1)
 _STEP_S = 1.5
 _FILM_MS = 350  # a frame's
+_METHOD = assessment, registration, tracking  # packages: after a change there rows are made again
 _COLOURS = {"nothing": "#b2182b", "the cut": "#2166ac", "both": "#67a9cf"}
 
 
@@ -314,21 +315,22 @@ def _measured(folder: Path, plan: str) -> list[dict[str, Any]]:
         tracker = scripting.tracker_of(folder / "case")
         for look in LOOKS["sequence"]:
             steps = [path for path in scenes if path.name.endswith(f"-{look}")]
-            for told in ("nothing", "the cut", "both"):
-                for frame, (scene, found) in enumerate(_followed(tracker, steps, told)):
-                    about, mine = _about(tracker, scene)
-                    about |= {"organ": folder.name, "scene": f"{folder.name}/{look}", "told": told}
-                    yield {**about, "frame": frame, **_judged(found, scene, mine)}
+            of = {path: _about(tracker, scene_folder.read_scene(path)) for path in steps}
+            for told in _COLOURS:
+                for frame, (path, scene, found) in enumerate(_followed(tracker, steps, told)):
+                    about = {"organ": folder.name, "scene": f"{folder.name}/{look}", **of[path]}
+                    yield {**about, "told": told, "frame": frame, **_judged(found, scene)}
 
     # The method's fingerprint is of intact organs.
-    code = scripting.code_sha256([Path(__file__), *Path(registration.__path__[0]).glob("*.py")])
-    about = {"scenes": [path.name for path in scenes], "registration": code}
+    code = [path for one in _METHOD for path in Path(one.__path__[0]).glob("*.py")]
+    about = {"scenes": [path.name for path in scenes]}
+    about |= {"code": scripting.code_sha256([Path(__file__), *code])}
     return scripting.kept(folder / "rows.json", about, follow if plan == "sequence" else measure)
 
 
 def _followed(
     tracker: Tracker, steps: list[Path], told: str
-) -> Iterator[tuple[scene_folder.Scene, Estimate | None]]:
+) -> Iterator[tuple[Path, scene_folder.Scene, Estimate | None]]:
     """Frame by frame, from the organ as it is in the CT; once it is cut they are handed on."""
     follower = Follower(tracker, FollowerConfig())
     for step, path in enumerate(steps):
@@ -344,7 +346,7 @@ def _followed(
             except NoEstimate:
                 found = None
             if cuts:
-                yield scene, found
+                yield path, scene, found
 
 
 def film(folder: Path, path: Path) -> None:
@@ -354,9 +356,8 @@ def film(folder: Path, path: Path) -> None:
     legend = {"tumor, estimated": colours.name_colour("tumor_1"), "truth (outline)": colours.TRUTH,
               "observed points": colours.SEEN}  # fmt: skip
     with TemporaryDirectory() as aside:
-        for scene, found in _followed(tracker, steps, "both"):
-            _, mine = _about(tracker, scene)
-            off_mm = _judged(found, scene, mine)["off_mm"]
+        for _, scene, found in _followed(tracker, steps, "both"):
+            off_mm = _judged(found, scene)["off_mm"]
             said = (
                 "no estimate" if found is None else f"{found.quality}, centre {off_mm:.1f} mm off"
             )
@@ -374,31 +375,31 @@ def film(folder: Path, path: Path) -> None:
     store.write_atomically(path, stream.getvalue())
 
 
-def _about(tracker: Tracker, scene: scene_folder.Scene) -> tuple[dict[str, Any], np.ndarray]:
-    """What a row says of a scene, and which of its targets are of the tumor that is cut out."""
-    assert scene.targets is not None
+def _about(tracker: Tracker, scene: scene_folder.Scene) -> dict[str, Any]:
+    """What a row says of a scene."""
     assert isinstance(tracker.model, RegistrationModel)
-    part = scene.meta["tumor"]
-    mine = scene.targets.labels == 1 + scene.reference.names.index(part)
     keys = ("state", "share", "lift_mm", "degrees", "exophytic", "surface", "cup", "smoke")
     about = {key: scene.meta[key] for key in (*keys, "tumor_moved_mm", "flap_turned_degrees")}
-    return {**about, "rigid_mm": rigid_centers_mm(tracker.model, scene)[part]}, mine
+    return {**about, "rigid_mm": rigid_centers_mm(tracker.model, scene)[scene.meta["tumor"]]}
 
 
-def _judged(found: Estimate | None, scene: scene_folder.Scene, mine: np.ndarray) -> dict[str, Any]:
+def _judged(found: Estimate | None, scene: scene_folder.Scene) -> dict[str, Any]:
     """How far the tumor's centre is off, and that of its places that is farthest off; and what was
     said: of all tumors, and of it alone."""
     if found is None:
-        return {"quality": "none"} | dict.fromkeys(("off_mm", "largest_mm", "radius_mm", "why"))
-    targets, motion = scene.targets, found.motion
+        missing = "off_mm", "largest_mm", "radius_mm", "why", "flap_seen"
+        return {"quality": "none", **dict.fromkeys(missing)}
+    targets, motion, cut = scene.targets, found.motion, found.report.cut
     assert targets is not None
     assert motion is not None
+    mine = targets.labels == 1 + scene.reference.names.index(scene.meta["tumor"])
     off_mm = motion.forward(targets.points_ct[mine]) - targets.points_mm[mine]
     bound = found.assessment.bounds.get(scene.meta["tumor"])
     return {
         "quality": found.quality, "off_mm": float(np.linalg.norm(off_mm.mean(0))),
         "largest_mm": float(np.linalg.norm(off_mm, axis=1).max()),
         "why": None if found.finding is None else found.finding.kind,
+        "flap_seen": None if cut is None else cut.flaps.get(scene.meta["tumor"]),
         "radius_mm": None if bound is None else bound.error_bound95_mm,
     }  # fmt: skip
 
@@ -406,7 +407,7 @@ def _judged(found: Estimate | None, scene: scene_folder.Scene, mine: np.ndarray)
 def _rows(
     tracker: Tracker, scene: scene_folder.Scene, known: tuple[Evidence, ...]
 ) -> Iterator[dict[str, Any]]:
-    about, mine = _about(tracker, scene)
+    about = _about(tracker, scene)
     cuts = [each for each in known if isinstance(each, Cut)]
     cut = tracker.with_cut(cuts) if cuts else tracker
     told = {
@@ -424,7 +425,7 @@ def _rows(
             found = using.locate(scene.cloud, grid=16, full_view=scene.depth, evidence=evidence)
         except NoEstimate:
             found = None
-        yield {**about, "told": name, **_judged(found, scene, mine)}
+        yield {**about, "told": name, **_judged(found, scene)}
 
 
 def table(rows: pd.DataFrame) -> pd.DataFrame:

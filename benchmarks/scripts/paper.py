@@ -25,8 +25,6 @@ import tumortrack as tt
 import tumortrack_occupancy
 from tumortrack.cli.console import live_line, progress_bar
 from tumortrack.core import store
-from tumortrack.core.mesh_query import surface_distance
-from tumortrack.core.types import Anatomy
 from tumortrack.io.case import load_case
 from tumortrack.io.scene_folder import read_scene
 from tumortrack.report import drawing
@@ -35,6 +33,7 @@ from tumortrack.simulation.deform import DragConfig
 from tumortrack.simulation.deform.drag import CONFIGURATIONS
 from tumortrack_benchmarks import scripting
 from tumortrack_benchmarks.document import table_of
+from tumortrack_benchmarks.fleet.checks import described
 from tumortrack_benchmarks.physics.kidneys import random_anatomy
 from tumortrack_benchmarks.physics.scenes import random_case
 from tumortrack_benchmarks.physics.twin import TURNED, VARIANTS, VIEWS, make_scenes
@@ -46,7 +45,6 @@ _PRESSED, _TURNED = ("D1", "D2", "D3"), ("Rot90", "Rot180", "Rot270")
 _ERRORS = ["hausdorff_mm", "hausdorff_one_sided_mm", "center_mm"]
 _HISTORY = "training/history.jsonl"
 _FINEST = 400  # voxels along the longest side, the paper's
-_BARE_MM, _BARE = 0.7, 0.1  # a tumor is free so near to the organ's surface; share: exophytic
 _SECOND = 1  # the first random kidney with two tumors, from this number on
 _STUDY_STEPS = 2000  # of 16 scenes, for each configuration: about the 31,000 of the paper
 _WRONG_MM = 5.0
@@ -93,13 +91,14 @@ def main(options: Options) -> None:
     with live_line("starting ...") as report:
         scenes = make_scenes(options.case, out / "scenes", wanted, report=report)
     models = {"limited": options.limited, "full": options.full, "default": options.case}
-    kinds = kinds_of(load_case(options.case).anatomy)
+    case = load_case(options.case)
+    kinds = [tumor["kind"] for tumor in described(case)["tumors"]]
     rows = _frame(
         {"method": name, **row}
         for name, model in models.items()
         for row in _measured(out / f"{name}.json", model, scenes, options.grid)
     )
-    rows["kind"] = rows.part.map(kinds)
+    rows["kind"] = rows.part.map(dict(zip(case.anatomy.names[1:], kinds, strict=True)))
     tables = {"paper": table(rows), "paper-overlap": overlap(rows)}
     curves = {
         name: history(models[name]) for name in _COLOURS if (models[name] / _HISTORY).exists()
@@ -128,15 +127,6 @@ def _frame(rows: Iterable[dict[str, Any]]) -> pd.DataFrame:
     frame = pd.DataFrame(list(rows))
     frame[_ERRORS] = frame[_ERRORS].astype(float).fillna(np.inf)
     return frame
-
-
-def kinds_of(anatomy: Anatomy) -> dict[str, str]:
-    """Whether each tumor is exophytic or endophytic; the organ is neither."""
-    bare = {
-        name: np.mean(surface_distance(anatomy.organ, part.vertices_mm) < _BARE_MM)
-        for name, part in zip(anatomy.names[1:], anatomy.tumors, strict=True)
-    }
-    return {name: "exophytic" if share > _BARE else "endophytic" for name, share in bare.items()}
 
 
 def _measured(path: Path, model: Path, scenes: list[Path], grid: int) -> list[dict[str, Any]]:

@@ -1,19 +1,11 @@
-"""The paper's table and its study: medians, the worst, and whose tumor is bare."""
+"""The paper's table: medians, the worst, and verdicts."""
 
 from __future__ import annotations
 
-import numpy as np
 import pandas as pd
 import paper
-import trimesh
 
-from tumortrack.core.types import Anatomy, Mesh
 from tumortrack_benchmarks.physics.twin import TURNED, USUAL, VARIANTS
-
-
-def ball(radius_mm, center_mm):
-    solid = trimesh.creation.icosphere(3, radius_mm)
-    return Mesh(solid.vertices + np.array(center_mm, float), solid.faces)
 
 
 def row(method, scene, part, kind, mm, quality="good", miou=0.8):
@@ -31,19 +23,6 @@ ROWS = pd.DataFrame([
     row("full", "a", "tumor_1", "endophytic", 3.0),
     row("full", "b", "tumor_1", "endophytic", 11.0, "poor"),
 ])  # fmt: skip
-
-
-def test_a_tumor_with_a_free_surface_is_exophytic():
-    organ = ball(40, (0, 0, 0))
-    anatomy = Anatomy((organ, cap(organ), ball(8, (10, 0, 0))))
-    assert paper.kinds_of(anatomy) == {"tumor_1": "exophytic", "tumor_2": "endophytic"}
-
-
-def cap(organ):
-    """Of the ball: what a plane cuts off, closed."""
-    whole = trimesh.Trimesh(organ.vertices_mm, organ.faces)
-    part = whole.slice_plane((0, 0, 25), (0, 0, 1), cap=True, engine="manifold")
-    return Mesh(part.vertices, part.faces)
 
 
 def test_a_line_has_medians_and_the_worst_beside_what_the_paper_says():

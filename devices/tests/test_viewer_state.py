@@ -16,7 +16,7 @@ from live_objects import small_setting, small_update
 from tumortrack.core import colours
 from tumortrack.core.estimate import Quality
 from tumortrack.live.values import TrackingResult
-from tumortrack_devices.sinks.viewer import ViewerSinkConfig
+from tumortrack_devices.sinks.viewer import ViewerSink, ViewerSinkConfig
 from viewer_page import page
 
 _SHOTS = 20
@@ -125,7 +125,7 @@ Place = tuple[slice, slice]
 
 
 def _number_of(
-    browser: Browser, sink: object, state: TrackingResult, parts: tuple[str, bool]
+    browser: Browser, sink: ViewerSink, state: TrackingResult, parts: tuple[str, bool]
 ) -> tuple[Place, np.ndarray]:
     """How the panel's box with the frame's number looks, and where it is."""
     seen: list[tuple[tuple[float, ...], np.ndarray]] = []
@@ -134,7 +134,7 @@ def _number_of(
 
     def feed() -> None:  # else, on a slow machine, the page tells of silence before it is seen
         while not ended.wait(0.1):
-            sink.publish(state)  # type: ignore[attr-defined]
+            sink.publish(state)
 
     def shown() -> bool:
         number = f"no. {state.sequence}"

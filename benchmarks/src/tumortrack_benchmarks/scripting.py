@@ -6,6 +6,7 @@ import hashlib
 import math
 import os
 import shlex
+import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -109,7 +110,7 @@ def _end_with_parent() -> None:
     def wait() -> None:
         if (parent := parent_process()) is not None:
             parent.join()
-            os._exit(1)
+            os.kill(os.getpid(), signal.SIGKILL)
 
     threading.Thread(target=wait, daemon=True).start()
 
