@@ -1,6 +1,6 @@
 """Measures all that the pages claim, with today's method: every table and picture.
 
-    make figures                       (by estimate 45 minutes on two cores; scenes before that, an hour)
+    make figures           (by estimate 45 minutes on two cores; scenes before that, an hour)
     make figures ARGS='noise following'        these steps alone
     make figures ARGS='--data DATA'            also your copies of KiTS19 (see population.py)
 
