@@ -387,9 +387,8 @@ def _judged(found: Estimate | None, scene: scene_folder.Scene) -> dict[str, Any]
     """How far the tumor's centre is off, and that of its places that is farthest off; and what was
     said: of all tumors, and of it alone."""
     if found is None:
-        missing = "off_mm", "largest_mm", "radius_mm", "why", "flap_seen"
-        return {"quality": "none", **dict.fromkeys(missing)}
-    targets, motion, cut = scene.targets, found.motion, found.report.cut
+        return {"quality": "none"} | dict.fromkeys(("off_mm", "largest_mm", "radius_mm", "why"))
+    targets, motion = scene.targets, found.motion
     assert targets is not None
     assert motion is not None
     mine = targets.labels == 1 + scene.reference.names.index(scene.meta["tumor"])
@@ -399,7 +398,6 @@ def _judged(found: Estimate | None, scene: scene_folder.Scene) -> dict[str, Any]
         "quality": found.quality, "off_mm": float(np.linalg.norm(off_mm.mean(0))),
         "largest_mm": float(np.linalg.norm(off_mm, axis=1).max()),
         "why": None if found.finding is None else found.finding.kind,
-        "flap_seen": None if cut is None else cut.flaps.get(scene.meta["tumor"]),
         "radius_mm": None if bound is None else bound.error_bound95_mm,
     }  # fmt: skip
 
